@@ -1,4 +1,4 @@
-"""D-BAT: diversity by disagreement (Pagliardini et al. 2022), the paper's Eq. (1)."""
+"""D-BAT: diversity by disagreement (Pagliardini et al. 2022), the objective of the paper's Eq. (1)."""
 
 import torch
 from torch import Tensor
@@ -8,18 +8,18 @@ def pair_loss(
     logits_a: Tensor,
     logits_b: Tensor,
 ) -> Tensor:
-    """Eq. (1), second term: ``-log(p_a (1 - p_b) + (1 - p_a) p_b)``, mean over unlabelled states.
+    """Return the second term of Eq. (1), the mean of ``-log(p_a (1 - p_b) + (1 - p_a) p_b)`` over unlabelled states.
 
-    Eq. (1) as printed multiplies matching classes, which literally rewards agreement. D-BAT's term is the log
-    probability that two members, each drawing its class from its own p, draw different ones. It is computed from
-    log-softmax: from probabilities, a logit gap of 20 already gives log 0 and a gradient of NaN.
+    Eq. (1) as printed multiplies the probabilities of matching classes, which literally rewards agreement. D-BAT's term
+    is the log probability that two members, each drawing a class from its own p, draw different classes. The loss is
+    computed from log-softmax. From probabilities, a logit gap of 20 would already give log 0 and a gradient of NaN.
 
     Args:
-        logits_a: float (..., N, 2), one member on N unlabelled states; column 1 is positive.
-        logits_b: float (..., N, 2), another member on the same states.
+        logits_a: float (..., N, 2), the logits of one member on N unlabelled states; column 1 is positive.
+        logits_b: float (..., N, 2), the logits of another member on the same states.
 
     Returns:
-        float (...,), at least 0, in nats; lower where the members disagree; 0 for N = 0. Symmetric in a
+        float (...,), at least 0, in nats. The loss is lower where the members disagree, 0 for N = 0, and symmetric in a
         and b.
 
     Source: Eq. (1) and arXiv:2202.04414 (D-BAT).

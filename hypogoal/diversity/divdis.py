@@ -8,18 +8,19 @@ from torch import Tensor
 from hypogoal.diversity import Context
 from hypogoal.diversity.mutual_information import log_mean, pair_loss
 
-RATIO_WEIGHT = 1.0  # of the ratio term beside the mutual information: own choice; the source tunes it
+RATIO_WEIGHT = 1.0  # the weight of the ratio term beside the mutual information: own choice, the source tunes it
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """Mutual information of all ordered pairs, plus each member's deviation from an expected share of positives.
+    """Return the mutual information of all ordered pairs, plus each member's deviation from an expected share of
+    positives.
 
-    ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``, with p(y) from the setting ``share``, at
-    the source the labelled states' share of positives. The second term keeps members from predicting one class for all
-    unlabelled states, where the first is 0 without a gradient.
+    The loss is ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``. p(y) comes from the setting
+    ``share``, which in the source is the labelled states' share of positives. The second term keeps members from
+    predicting one class for all unlabelled states, because there the first term is 0 without a gradient.
 
     Returns:
-        float (), in nats, at least 0 up to rounding; 0 for no states.
+        float (), in nats, at least 0 up to rounding. The loss is 0 if there are no states.
 
     Source: arXiv:2202.03418 (DivDis), its repulsion loss and its regularisation loss.
     """
@@ -34,7 +35,7 @@ def ensemble_loss(context: Context) -> Tensor:
 
 
 def dependence(context: Context) -> list[Tensor]:
-    """Mutual information of all pairs of members, in terms () whose sum it is; there is at least one state."""
+    """Return terms () whose sum is the mutual information of all pairs of members. There must be at least one state."""
     logits, frozen = context.unlabelled, context.frozen
     terms = []
     for number in range(1, len(logits)):
@@ -47,6 +48,6 @@ def dependence(context: Context) -> list[Tensor]:
 
 
 def log_shares(context: Context) -> Tensor:
-    """Logarithms of the shares of negatives and positives among unlabelled states, float (K, 2), of each member."""
+    """Return the logarithms of each member's shares of negatives and positives of unlabelled states, float (K, 2)."""
     log_classes = torch.log_softmax(context.unlabelled, dim=-1)
     return log_mean(log_classes, dim=1)

@@ -1,4 +1,4 @@
-"""Mutual information of members' classes: DivDis without its ratio term, which the authors' code optimises."""
+"""Mutual information of members' classes: DivDis without its ratio term, as the authors' code optimises it."""
 
 import math
 
@@ -12,23 +12,24 @@ def pair_loss(
     logits_a: Tensor,
     logits_b: Tensor,
 ) -> Tensor:
-    """Mutual information of two members' classes over the unlabelled states, to be minimised.
+    """Return the mutual information of two members' classes over the unlabelled states, which training minimises.
 
-    ``KL(mean_n p_a(y|n) p_b(z|n)  ||  mean_n p_a(y|n) x mean_n p_b(z|n))``: the joint distribution of both members'
-    classes over the batch against the product of their marginals. It is 0 if one member's predictions carry no
-    information about the other's. So it is lowest when members differ on as many states as independence implies: always
-    contradicting another member is as informative as always agreeing. If a member predicts one class for all states, it
-    is 0 with a gradient near 0, and members that agree there stay so: DivDis adds a ratio term against that
-    (:mod:`hypogoal.diversity.divdis`), which the authors dropped.
+    The mutual information is ``KL(mean_n p_a(y|n) p_b(z|n)  ||  mean_n p_a(y|n) x mean_n p_b(z|n))``: the joint
+    distribution of both members' classes over the batch, against the product of their marginals. The loss is 0 if one
+    member's predictions carry no information about the other member's predictions. So the loss is lowest when members
+    differ on as many states as independence implies, because always contradicting another member is as informative as
+    always agreeing. If a member predicts one class for all states, the loss is 0 with a gradient near 0, and members
+    that agree there stay in agreement. DivDis adds a ratio term against that (:mod:`hypogoal.diversity.divdis`), which
+    the authors dropped.
 
     Args:
-        logits_a: float (..., N, 2), one member on N unlabelled states.
-        logits_b: float (..., N, 2), another member on the same states.
+        logits_a: float (..., N, 2), the logits of one member on N unlabelled states.
+        logits_b: float (..., N, 2), the logits of another member on the same states.
 
     Returns:
-        float (...,), from 0 to log 2 up to rounding, in nats; 0 for N = 0. Symmetric in a and b.
+        float (...,), from 0 to log 2 up to rounding, in nats. The loss is 0 for N = 0, and symmetric in a and b.
 
-    Source: arXiv:2202.03418 (DivDis); the paper's appendix calls it the Kullback-Leibler divergence.
+    Source: arXiv:2202.03418 (DivDis). The paper's appendix calls the loss the Kullback-Leibler divergence.
     """
     states = logits_a.shape[-2]
     if states == 0:
@@ -50,5 +51,5 @@ def log_mean(
     logs: Tensor,
     dim: int,
 ) -> Tensor:
-    """The logarithm of the mean of what these are the logarithms of."""
+    """Return the logarithm of the mean along ``dim`` of the numbers whose logarithms are ``logs``."""
     return torch.logsumexp(logs, dim=dim) - math.log(logs.shape[dim])

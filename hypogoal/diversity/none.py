@@ -7,9 +7,9 @@ def pair_loss(
     logits_a: Tensor,
     logits_b: Tensor,
 ) -> Tensor:
-    """0, but a function of both members, so that it can be differentiated like the others.
+    """Return 0, computed from both members' logits so that it can be differentiated like other losses.
 
-    Takes two members' logits (..., N, 2) on N unlabelled states; returns float (...,), 0 with gradients of 0.
+    Takes two members' logits (..., N, 2) on N unlabelled states. Returns float (...,), 0 with gradients of 0.
     """
     differences = logits_a - logits_b
     return (differences * 0.0).sum(dim=(-2, -1))

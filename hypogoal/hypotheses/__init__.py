@@ -1,1 +1,1 @@
-"""Hypotheses: what a sub-goal may depend on. Member networks, ensembles, and their training."""
+"""Hypotheses about what a sub-goal depends on: the member networks, the ensembles of members, and their training."""

@@ -1,28 +1,33 @@
-"""Members whose diversity weight is chosen from the user's own labels: ``diversity_weight=auto`` (beyond the paper).
+"""Choice of the diversity weight from the user's own labels: ``diversity_weight=auto`` (beyond the paper).
 
-Too small a weight leaves members alike, too large a one makes them forget the labels. Both show without labels of
-other places. So a quarter of the labels is held out; members are trained without diversity, then with each of
-``WEIGHTS`` from the largest down, and the first is taken at which every member is as right about the held-out labels,
-within a standard error (Breiman et al. 1984, section 3.4.3)::
+A weight that is too small leaves the members alike, and a weight that is too large makes the members forget the labels.
+Both faults show without any labels from other places. So a quarter of the labels is held out. Members are first trained
+without diversity, then with each of ``WEIGHTS`` from the largest down. The search ends at the first weight at which
+every member is as right about the held-out labels as members without diversity, within a standard error (Breiman et al.
+1984, section 3.4.3)::
 
     accuracy >= a - s
     a = (right_1 / n_1 + right_0 / n_0) / 2
     s = sqrt(q_1 (1 - q_1) / n_1 + q_0 (1 - q_0) / n_0) / 2,  q_c = (right_c + 1) / (n_c + 2)
 
 Of the ``n_c`` held-out states of class c, ``right_c`` are predicted right without diversity. q_c is Laplace's rule of
-succession: a member without a fault would have s = 0. A member that predicts one class for all unlabelled states is no
-hypothesis, so its weight is passed over, unless members without diversity do so, too.
+succession, because with the plain share a member without a fault would have s = 0. A member that predicts one class for
+all unlabelled states is no hypothesis. So a weight that makes a member constant is passed over, unless members without
+diversity are constant, too.
 
-Members keep all labels at any weight if they can tell the labelled place from others: they then say one thing there and
-contradict each other elsewhere. So a weight is passed over, too, at which two members differ on more than half of the M
-unlabelled states, ``1/2 + sqrt(1/4 / M)``. Rules that know nothing of each other and say yes to shares a and b of the
-states differ on ``a (1 - b) + b (1 - a)``, which is at most 1/2 if neither says yes to more than half.
+If the labelled place can be told from other places, members can keep all labels at any weight: the members then agree
+in the labelled place and contradict each other elsewhere. So a weight is also passed over if two members differ, in
+the mean over pairs, on more than ``1/2 + sqrt(1/4 / M)`` of the M unlabelled states. Half is the bound because two
+rules that know nothing of each other, and say yes to shares a and b of the states, differ on ``a (1 - b) + b (1 - a)``.
+That is at most 1/2 if neither rule says yes to more than half of the states.
 
-The first member of a sequential ensemble is trained on the labels alone, once for all weights. If it mixes features,
-later members can only mix what is left. So ``restarts`` of them begin, and after ``EARLY`` of its steps the one stays
-whose predictions tell most about unlabelled states, by the mutual information of state and prediction, H(mean p) -
-mean H(p) (Bridle et al. 1991): a mixture is in doubt where its features part, or says no to most states. Members that
-are trained at once end in different mixtures, so of ``restarts`` whole ensembles the one stays that tells most.
+The first member of a sequential ensemble is trained on the labels alone, once for all weights. If the first member
+mixes features, later members can only mix what is left. So ``restarts`` first members begin training. After the share
+``EARLY`` of the steps, only the member whose predictions tell most about unlabelled states goes on. What predictions
+tell is the mutual information of state and prediction, H(mean p) - mean H(p) (Bridle et al. 1991). The mutual
+information is low for a mixture, because a mixture is in doubt where its features part, or says no to most states.
+Members that are trained at once end in different mixtures. So ``restarts`` whole ensembles are trained, and the
+ensemble that tells most is kept.
 """
 
 from collections.abc import Generator, Iterator
@@ -48,33 +53,41 @@ from hypogoal.hypotheses.views import StateOrigins
 from hypogoal.observations import Observations
 
 WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4)
-FOLDS = 4  # one state in so many is held out
-FEWEST = 8  # held-out states of a class: with fewer, each fold is held out in turn; with fewer in all, nothing is tried
+FOLDS = 4  # one state in FOLDS is held out
+# A fold needs this many held-out states of each class: with fewer, every fold is held out in turn. If a class has fewer
+# labelled states in all, no weight is tried.
+FEWEST = 8
 HALF = 0.5
-EARLY = 1 / 3  # of a first member's steps
-SMALL = 1e-9  # probabilities below have no entropy
+EARLY = 1 / 3  # the share of its steps after which a first member is compared with the other restarts
+SMALL = 1e-9  # probabilities are raised to this at least, because log 0 is not finite
 FEW = "{} labels of a class are too few to choose the diversity weight by, so it is {}"
 SINGLE = "too few groups have both classes, so single states are held out: near copies make them easy"
 
-Outcome = Generator[Losses, None, State]  # of a training: yields after each step, returns what came out
+Outcome = Generator[Losses, None, State]  # one training: it yields the losses of each step and returns its outcome
 
 
 @dataclass(frozen=True)
 class Tried:
-    """What one weight did: the worst member on held-out labels, and how members differ on unlabelled states."""
+    """Result of one tried weight: the worst member's held-out accuracy, and how members differ on unlabelled states."""
 
     weight: float
     accuracy: float
     disagreement: float | None  # None with one member
     constant: bool  # some member predicts one class for all unlabelled states
-    contrary: bool  # members differ on more than half of them
+    contrary: bool  # members differ on more than half of the unlabelled states
     kept: bool
 
 
 def held_out(labels: Bools, groups: Ints | None, seed: int) -> tuple[list[Bools], str]:
-    """The labelled states (N,) that are held out, in one fold or in each, and what a user should know of it.
+    """Choose which labelled states are held out.
 
-    A fold has a share of each class, at random; states of a group are together.
+    States are assigned to ``FOLDS`` folds at random. Every fold has about the same share of each class. All states of a
+    group are in the same fold, unless fewer than ``FOLDS`` groups have states of a class.
+
+    Returns:
+        The folds, a list of bool (N,) arrays that are true for held-out states, and a remark that a user should know.
+        The list has one fold, or all folds if the first fold has fewer than ``FEWEST`` states of a class. The list is
+        empty if a class has fewer than ``FEWEST`` labels in all. The remark is empty if there is nothing to know.
     """
     fewest = min(labels.sum(), (~labels).sum())
     if fewest < FEWEST:
@@ -99,12 +112,16 @@ def held_out(labels: Bools, groups: Ints | None, seed: int) -> tuple[list[Bools]
 
 
 def accuracies_of(right: Bools, labels: Bools) -> Doubles:
-    """Members' balanced accuracies (K,), from what they have right (N, K)."""
+    """Return the members' balanced accuracies, float64 (K,), given which predictions are ``right``, bool (N, K)."""
     return scores.member_scores(right == labels[:, None], labels)["balanced_accuracy"]
 
 
 def lowest_kept(right: Bools, labels: Bools) -> float:
-    """The balanced accuracy that members must keep, a - s, from what members without diversity have right (N, K)."""
+    """Return a - s, the balanced accuracy that members trained with diversity must keep.
+
+    ``right``, bool (N, K), says which predictions of members without diversity are right. a and s are those of the
+    worst of these K members.
+    """
     accuracies = accuracies_of(right, labels)
     worst = accuracies.argmin()
     variance = 0.0
@@ -116,7 +133,7 @@ def lowest_kept(right: Bools, labels: Bools) -> float:
 
 
 def information_of(probabilities: Floats) -> float:
-    """The mutual information of state and prediction, in nats, from a member's probabilities (M,)."""
+    """Return the mutual information of state and prediction, in nats, from a member's probabilities (M,)."""
 
     def entropy(positive: Any) -> Any:
         both = np.clip(np.stack([positive, 1 - positive]), SMALL, 1)
@@ -126,20 +143,27 @@ def information_of(probabilities: Floats) -> float:
 
 
 class AutoTraining:
-    """One sub-goal's ensemble in training, with what is ``auto`` chosen first; else as :class:`EnsembleTraining`.
+    """The training of one sub-goal's ensemble, which first chooses the settings that are ``auto``.
+
+    With no setting to choose, the training is the one of :class:`EnsembleTraining`.
 
     Args:
-        observations, labels, unlabelled, seed, device: as of :class:`EnsembleTraining`.
+        observations, labels, unlabelled, seed, device: as for :class:`EnsembleTraining`.
         config: the settings.
-        origins: as there; the labelled states' origin ``group``, if any, says which are held out together.
-        saved: a ``snapshot``, to go on from. Trainings that were done are not done again: their outcomes are in it.
+        origins: as for :class:`EnsembleTraining`. Labelled states with the same origin ``group`` are held out together.
+        saved: a ``snapshot`` from which to go on. The snapshot has the outcomes of the trainings that were finished, so
+            they are not repeated.
 
     Attributes:
-        now: the training at work, at the end that of the outcome; is_last: whether it is that.
-        step: how many steps are done, of all trainings; most: how many there are at most.
-        weight: of diversity, and share: of positives, once they are chosen.
-        tried: what each weight did that was tried; lowest: the balanced accuracy that members had to keep.
-        remark: what a user should know of how labels were held out; empty if nothing.
+        now: the training at work. At the end, ``now`` is the training of the final ensemble.
+        is_last: whether ``now`` is the training of the final ensemble.
+        step: the number of steps done, over all trainings.
+        most: the largest number of steps that there can be, over all trainings.
+        weight: the weight of diversity, once chosen.
+        share: the share of positives, once chosen.
+        tried: the results of the weights that were tried.
+        lowest: the balanced accuracy that members had to keep.
+        remark: what a user should know of how labels were held out. The remark is empty if there is nothing to know.
     """
 
     def __init__(
@@ -185,12 +209,14 @@ class AutoTraining:
 
     @property
     def ensemble(self) -> Ensemble:
-        """The members of the training at work."""
+        """The ensemble whose members are being trained now."""
         assert self.now is not None
         return self.now.ensemble
 
     def cost(self, folds: int, weights: int) -> int:
-        """The steps of all trainings, if in so many folds so many weights are tried, each to its end."""
+        """Return the number of steps of all trainings if ``weights`` weights are tried in ``folds`` folds, each to its
+        end.
+        """
         config = self.config
         first = config.steps + (config.restarts - 1) * self.early if self.begins_alone else 0
         rounds = config.members if config.schedule == "sequential" else 1
@@ -199,12 +225,12 @@ class AutoTraining:
         return folds * ((first or others) + weights * others) + first + last
 
     def snapshot(self) -> State:
-        """All that the next steps depend on."""
+        """Return all that the next steps depend on."""
         now = self.now.snapshot() if self.now else self._saved
         return {"outcomes": self._outcomes, "now": now, "step": self.step}
 
     def summary(self) -> dict[str, Any]:
-        """What was chosen and why, once all steps are done, for a manifest."""
+        """Return what was chosen and why, for a manifest, once all steps are done."""
         held = [self.labels[fold] for fold in self.folds]
         return {
             "diversity_weight": self.weight,
@@ -217,9 +243,9 @@ class AutoTraining:
         }
 
     def steps(self) -> Iterator[Losses]:
-        """Take the steps that are left; yields the losses of each.
+        """Take the steps that are left, and yield the losses of each step.
 
-        ``NumericalError``: a loss is NaN or Inf.
+        Raises ``NumericalError`` if a loss is NaN or Inf.
         """
         if self.searches:
             self.weight = yield from self._search()
@@ -234,7 +260,7 @@ class AutoTraining:
         yield from self._train(everything, begun, self.weight)
 
     def _search(self) -> Generator[Losses, None, float]:
-        """Try weights from the largest down, until members bear one."""
+        """Try weights from the largest down until the members bear one, and return that weight."""
         without: list[State] = []
         for fold in self.folds:
             without.append((yield from self._begin(~fold, fold)))
@@ -261,9 +287,10 @@ class AutoTraining:
         return weight
 
     def _begin(self, rows: Bools, held: Bools | None = None) -> Outcome:
-        """Train without diversity on the labels of ``rows``: all members, or a first one alone.
+        """Train without diversity on the labels of ``rows``: all members at once, or a first member alone.
 
-        Among unlabelled states as many positives are expected from then on as the first one predicts.
+        If the setting ``share`` is ``auto``, this also sets the share of positives to expect among unlabelled states:
+        the share that the first member predicts.
         """
         members = 1 if self.begins_alone else self.config.members
         begun = self._fresh
@@ -275,14 +302,18 @@ class AutoTraining:
         return outcome
 
     def _best_start(self, rows: Bools, members: int, until: int, weight: float = 0.0) -> Outcome:
-        """Begin ``restarts`` trainings: the one that tells most after so many steps, to go on from."""
+        """Train ``restarts`` times for ``until`` steps, and return the start that tells most.
+
+        A start is a training to go on from. The start that tells most is the one whose predictions have the most mutual
+        information with the unlabelled states.
+        """
         best = self._fresh
         for restart in range(self.config.restarts):
             seed = seeding.seed_for(self.seed, "restart", restart) if restart else self.seed
             begun = self._fresh | {"seed": seed}
             start = yield from self._train(rows, begun, weight, members=members, until=until)
             worse, best = sorted([start, best], key=itemgetter("information"))
-            worse["training"] = None  # it may be large
+            worse["training"] = None  # the snapshot of a training that is not continued may be large
         return best
 
     def _train(
@@ -295,9 +326,11 @@ class AutoTraining:
         held: Bools | None = None,
         until: int = 0,
     ) -> Outcome:
-        """One training on the labels of ``rows``, from the seed, the first member and the snapshot that have ``begun``.
+        """Train once on the labels of ``rows``, from the seed, the first member and the snapshot in ``begun``.
 
-        It ends ``until`` so many steps, or, if there is one fold, once a member has too few of the labels of ``held``.
+        The training ends after ``until`` steps, or at the end of all steps if ``until`` is 0. If there is only one
+        fold, a sequential training also ends as soon as a member is trained that has too few of the labels of ``held``
+        right.
         """
         self._turn += 1
         if self._turn <= len(self._outcomes):
@@ -327,7 +360,7 @@ class AutoTraining:
         return self._outcomes[-1]
 
     def _outcome(self, now: EnsembleTraining, held: Bools | None, is_candidate: bool) -> State:
-        """What members predict, of unlabelled states and of held-out labels, and what is gone on from."""
+        """Return what members predict for unlabelled and held-out states, and what a later training needs to go on."""
         probabilities = now.predict(self.unlabelled)
         predictions = probabilities > THRESHOLD
         positive = predictions.mean(axis=0)
@@ -343,11 +376,11 @@ class AutoTraining:
         }
 
     def _right(self, now: EnsembleTraining, held: Bools) -> Bools:
-        """What members have right of held-out labels (n, K)."""
+        """Return which held-out labels each member predicts right, bool (n, K)."""
         return (now.predict(self.observations[held]) > THRESHOLD) == self.labels[held][:, None]
 
     def _has_lost(self, now: EnsembleTraining, held: Bools | None) -> bool:
-        """Whether a member at the end of its training has fewer held-out labels right than it must keep."""
+        """Say whether a member at the end of its training has a lower held-out accuracy than it must keep."""
         if held is None or now.done < self.config.steps or len(self.folds) > 1:
             return False
         accuracies = accuracies_of(self._right(now, held), self.labels[held])
@@ -357,7 +390,10 @@ class AutoTraining:
 def training_of(
     labelled: States, unlabelled: States, sub_goal: str, config: TrainEnsembleConfig, seed: int, **more: Any
 ) -> AutoTraining:
-    """The training of a sub-goal's ensemble, not begun; ``seed`` is the run's, ``more`` as of :class:`AutoTraining`."""
+    """Return the training of a sub-goal's ensemble, before its first step.
+
+    ``seed`` is the seed of the run. ``more`` are further arguments of :class:`AutoTraining`.
+    """
     return AutoTraining(
         labelled.observations,
         labelled.labels,

@@ -1,4 +1,4 @@
-"""The states that an ensemble is trained on: drawn in batches and passed through the members."""
+"""The states that an ensemble is trained on: how batches are drawn and passed through the members."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain, cycle, islice, repeat
@@ -19,27 +19,27 @@ from hypogoal.hypotheses.networks import at_once, inputs_of
 from hypogoal.hypotheses.views import Origins, changed_by, pools_of
 from hypogoal.observations import Observations, values_in
 
-Numbers = Ints  # of states, (B,)
-EVALUATED_AT_ONCE = 256  # states, when no gradient is kept
+Numbers = Ints  # (B,), the indices of states
+EVALUATED_AT_ONCE = 256  # states in one pass that keeps no gradients
 NONE = np.zeros(0, int)
 
 
 class TrainingStates(Resumable):
-    """Labelled states (N, *obs) with labels (N,), and unlabelled ones (M, *obs), each numbered from 0.
+    """The training states: labelled states (N, *obs) with labels (N,), and unlabelled states (M, *obs).
 
-    Pictures are kept and not copied. Those of which many patches are equal are kept as tables, see
-    :mod:`hypogoal.hypotheses.patches`.
+    States of both kinds are numbered from 0. Pictures are kept without a copy. If many patches of the pictures are
+    equal, the pictures are kept as tables, see :mod:`hypogoal.hypotheses.patches`.
 
     Args:
-        ensemble: whose members will see the states, on its device and by its view.
-        origins: of the labelled states, (N,) by name, for a view that draws by them.
+        ensemble: the ensemble whose members will see the states. Its device and its view are used.
+        origins: the origins of the labelled states, (N,) by name, for a view that draws by origin.
 
     Attributes:
-        changes: generators of a view's random changes of labelled and of unlabelled states. There are two since methods
-            differ in their use of the second.
+        changes: the random generators of a view's changes, one for labelled and one for unlabelled states. There are
+            two because methods differ in how often they change unlabelled states.
 
     Raises:
-        UserError: labels of one class only.
+        UserError: if all labels are of one class.
     """
 
     CHANGING = ("changes",)
@@ -66,11 +66,11 @@ class TrainingStates(Resumable):
         self._at_once = at_once(EVALUATED_AT_ONCE, (size,))
 
     def begin(self, seed: int) -> None:
-        """Begin the random changes of one training; before any :meth:`logits`."""
+        """Begin the random changes of one training. Call this before any :meth:`logits`."""
         self.changes = [rng_for(seed, "changes", group) for group in ("labelled", "unlabelled")]
 
     def targets(self, labelled: Numbers) -> Tensor:
-        """Classes int64 (B,) of labelled states (B,)."""
+        """Return the classes, int64 (B,), of the labelled states with indices ``labelled`` (B,)."""
         return self._targets[tensor(labelled, self.device)]
 
     def logits(
@@ -81,16 +81,16 @@ class TrainingStates(Resumable):
         *,
         counted: bool = True,
     ) -> tuple[Tensor, Tensor]:
-        """All K networks' logits of labelled (K, B, 2) and of unlabelled states (K, N, 2).
+        """Return the logits of all K networks for labelled states, (K, B, 2), and for unlabelled states, (K, N, 2).
 
-        In training mode the view changes the states at random, and ``counted`` says whether BatchNorm's running
-        statistics include the unlabelled ones, see :func:`plain_forward`.
+        In training mode the view changes the states at random. ``counted`` says whether BatchNorm's running statistics
+        include the unlabelled states, see :func:`plain_forward`.
         """
         groups = (labelled, unlabelled)
         inputs = self._inputs(groups, changing=networks[0].training)
         sizes = [len(group) for group in groups]
         logits = []
-        for network in networks:  # up to rounding the same for either kind of inputs (a test asserts it)
+        for network in networks:  # both kinds of inputs give equal logits up to rounding (a test asserts it)
             if isinstance(inputs, patches.PatchBatch):
                 logits.append(patches.forward(network, inputs, counted))
             else:
@@ -99,7 +99,7 @@ class TrainingStates(Resumable):
         return on_labelled, on_unlabelled
 
     def frozen_logits(self, networks: Sequence[nn.Sequential]) -> Tensor:
-        """F trained networks' logits, float (F, M, 2), of all unlabelled states, in evaluation mode."""
+        """Return the logits of F trained networks, float (F, M, 2), for all unlabelled states, in evaluation mode."""
         if not networks:
             return torch.zeros(0, self.n_unlabelled, 2, device=self.device)
         for network in networks:
@@ -116,10 +116,11 @@ class TrainingStates(Resumable):
         config: EnsembleConfig,
         seed: int,
     ) -> Iterator[tuple[Numbers, Numbers]]:
-        """``config.steps`` batches: numbers of labelled (B,) and of unlabelled states (B,).
+        """Yield ``config.steps`` batches: the indices of labelled states (B,) and of unlabelled states (B,).
 
-        Half of the labelled ones are positive, unless the view has other pools (:meth:`View.pools`). Every state of a
-        pool is drawn once before any is drawn again. Unlabelled batches are empty if there are no such states.
+        Half of the labelled states are positive, unless the view has other pools (:meth:`View.pools`). Every state of a
+        pool is drawn once before any state is drawn again. The indices of unlabelled states are empty if there are no
+        unlabelled states.
         """
         pools, share = pools_of(self.view, self.labels, self._origins)
         positives = min(max(1, int(share * config.batch_size)), config.batch_size - 1)
@@ -147,7 +148,7 @@ class TrainingStates(Resumable):
         groups: tuple[Numbers, Numbers],
         changing: bool,
     ) -> Tensor | patches.PatchBatch:
-        """The networks' inputs for labelled and unlabelled states: pictures, or their patches."""
+        """Return the networks' inputs for labelled and unlabelled states: pictures, or the patches of pictures."""
         if self._tables is not None:
             labelled, unlabelled = groups
             tabled = (labelled, unlabelled + len(self.labels))
@@ -169,7 +170,10 @@ def _draws(
     seed: int,
     name: str,
 ) -> Iterator[Numbers]:
-    """Endlessly, ``count`` items of the pools in turn; a pool is shuffled again once all its items were drawn."""
+    """Yield ``count`` items at a time, without end, taken from the pools in turn.
+
+    A pool is shuffled again once all its items were drawn.
+    """
     streams = []
     for number, pool in enumerate(pools):
         names = [name, number] if len(pools) > 1 else [name]
@@ -186,12 +190,13 @@ def plain_forward(
     sizes: Sequence[int],
     counted: bool,
 ) -> Tensor:
-    """A network's outputs for so many labelled inputs and, behind them, so many unlabelled ones.
+    """Return a network's outputs for labelled inputs followed by unlabelled inputs; ``sizes`` are the two numbers of
+    inputs.
 
-    In training, BatchNorm standardises each of the two groups by the group's own mean and variance, as if the other
-    were not there. The running mean and variance, by which a trained network predicts, follow both groups, first the
-    labelled one; where the unlabelled one is not ``counted``, they follow the labelled one alone. All other layers take
-    both groups at once.
+    In training, BatchNorm standardises each of the two groups by the mean and variance of that group alone. The running
+    mean and variance, by which a trained network predicts, follow both groups, the labelled group first. If the
+    unlabelled group is not ``counted``, the running mean and variance follow the labelled group alone. All other layers
+    take both groups at once.
     """
     values = inputs
     for layer in network:

@@ -1,11 +1,13 @@
 """What a member looks at in a state: DeepLift attributions, and a check that they are complete (Figures 2, 9).
 
-Members with layers for which DeepLift has no valid rules are explained by integrated gradients (Sundararajan et al.
-2017): means over ``STEPS`` states between the baseline and the state, complete up to the error of so few steps.
+Some members have layers for which DeepLift has no valid rules. Such members are explained by integrated gradients
+(Sundararajan et al. 2017): means over ``STEPS`` states between the baseline and the state. Integrated gradients are
+complete up to the error of using only ``STEPS`` states.
 
-Attributed are the log-odds, the difference of a member's two logits. Their sign is the prediction at a threshold of
-0.5, so positive attributions speak for a positive prediction. A state's attributions, summed over pixels and frames,
-must equal its log-odds minus the baseline's; the error is reported.
+Attributions explain the log-odds, which are the difference of a member's two logits. The sign of the log-odds is the
+prediction at a threshold of 0.5, so positive attributions speak for a positive prediction. A state's attributions,
+summed over pixels and frames, must equal the state's log-odds minus the baseline's log-odds. The error of this equation
+is reported.
 """
 
 from __future__ import annotations
@@ -32,8 +34,10 @@ from hypogoal.observations import (
 )
 
 DEEP_LIFT, INTEGRATED = "DeepLift", "integrated gradients"
-STEPS, AT_ONCE = 32, 64  # gradients for a state's integral; images whose gradients are computed together
-INSIDE = 64  # DeepLift's memory relative to a plain pass: both states, in double, with copies of pooled pixels
+STEPS, AT_ONCE = 32, 64  # the number of gradients in a state's integral, and of images in one backward pass
+# DeepLift needs about this many times the memory of a plain pass, because it keeps the state and the baseline in
+# float64, with copies of pooled pixels.
+INSIDE = 64
 RULED = (nn.Conv2d, nn.Linear, nn.BatchNorm2d, nn.ReLU, nn.AvgPool2d, nn.AdaptiveAvgPool2d, nn.Flatten, nn.Dropout)
 
 if TYPE_CHECKING:
@@ -42,25 +46,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Attributions:
-    """Attributions of every member on n states."""
+    """The attributions of every member for n states.
 
-    values: Doubles  # (n, K, H, W, C), or (n, K, *shape), of mixed ones (n, K, D), in log-odds
-    log_odds: Doubles  # (n, K)
-    baseline_log_odds: Doubles  # (K,)
+    Attributes:
+        values: float64 (n, K, H, W, C) for pictures, (n, K, *shape) for numbers, (n, K, D) for mixed observations, in
+            log-odds.
+        log_odds: float64 (n, K), the members' log-odds of the states.
+        baseline_log_odds: float64 (K,), the members' log-odds of the baseline.
+        method: the name of the method, ``DeepLift`` or ``integrated gradients``.
+    """
+
+    values: Doubles
+    log_odds: Doubles
+    baseline_log_odds: Doubles
     method: str
 
     def completeness_error(self) -> Doubles:
-        """|sum of the attributions - (log-odds of the state - log-odds of the baseline)|, (n, K)."""
+        """Return |sum of attributions - (log-odds of the state - log-odds of the baseline)|, float64 (n, K)."""
         sums = self.values.reshape(*self.log_odds.shape, -1).sum(-1)
         return np.abs(sums - (self.log_odds - self.baseline_log_odds))
 
 
 def mean_state(observations: Observations) -> Observations:
-    """The baseline: the mean of viewed observations, (N, ...) -> (...); of pictures rounded, uint8 (H, W, C).
+    """Return the mean (...) of viewed observations (N, ...), which is the baseline.
 
-    Against a black image, which is a state of no domain, the things that all states share (walls, the floor) would get
-    most of the attribution, and black things (a pit, an open door) none. Against the mean state, only differences from
-    the usual get any.
+    For pictures the mean is rounded, uint8 (H, W, C). A black image would be a bad baseline, because it is a state of
+    no domain. Things that all states share (walls, the floor) would get most of the attribution, and black things (a
+    pit, an open door) would get none. With the mean state as the baseline, only differences from the usual get
+    attribution.
     """
     dtype = observations.dtype
     if dtype.names:
@@ -75,7 +88,7 @@ def mean_state(observations: Observations) -> Observations:
 
 
 def by_key(values: NDArray[np.floating], dtype: DType) -> Array:
-    """Attributions (..., D) of mixed observations as float32 with a field for each key."""
+    """Return attributions (..., D) of mixed observations as a float32 array with one field for each key."""
     fields = fields_of((), dtype)
     states = values.shape[:-1]
     parts = np.empty(states, [(key, NUMBERS, shape) for key, (_, shape) in fields.items()])
@@ -91,7 +104,11 @@ def by_key(values: NDArray[np.floating], dtype: DType) -> Array:
 
 
 def method_of(member: Any) -> str:
-    """How a member is explained: by DeepLift if it is a chain of layers with valid rules, each used once."""
+    """Return the name of the method that explains a member.
+
+    The method is DeepLift if the member is a chain of layers with valid rules, each used once. Otherwise it is
+    integrated gradients.
+    """
     layers = list(member.children())
     ruled = all(type(layer) in RULED or _separable(layer) for layer in layers)
     return DEEP_LIFT if ruled and len(layers) == len(member) else INTEGRATED
@@ -102,10 +119,17 @@ def attributed(
     observations: Observations,
     baseline: Observations,
 ) -> Attributions:
-    """Every member's attributions, by the method valid for it.
+    """Compute every member's attributions, by the method that is valid for the members.
 
-    DeepLift has the rescale rule (Shrikumar et al. 2017), and computes in double, where rounding does not matter.
-    ``observations`` are the members' view of a few states (n, ...), compared with ``baseline`` (...).
+    DeepLift uses the rescale rule (Shrikumar et al. 2017) and computes in float64, where rounding does not matter.
+
+    Args:
+        ensemble: the ensemble of K members.
+        observations: the members' view of a few states (n, ...).
+        baseline: the members' view of the baseline (...), with which the states are compared.
+
+    Returns:
+        The attributions of n states by K members.
     """
     method = method_of(ensemble.members[0])
     explained = _deep_lift if method == DEEP_LIFT else _integrated
@@ -129,7 +153,10 @@ def _integrated(
     inputs: Tensor,
     reference: Tensor,
 ) -> tuple[nn.Module, Tensor]:
-    """A network of log-odds (n, 1), and the attributions (n, ...) to its inputs."""
+    """Attribute by integrated gradients.
+
+    Returns a network that gives log-odds (n, 1), and the attributions (n, ...) to its inputs.
+    """
     from captum.attr import IntegratedGradients
 
     network = nn.Sequential(member, _LogOdds())
@@ -150,12 +177,12 @@ def _deep_lift(
     inputs: Tensor,
     reference: Tensor,
 ) -> tuple[nn.Module, Tensor]:
-    """As :func:`_integrated`, in double."""
+    """Return what :func:`_integrated` returns, by DeepLift and in float64."""
     inputs, reference = inputs.double(), reference.double()
     network = attributable(copy.deepcopy(member).cpu().double().eval(), reference)
     parts = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about tqdm's bar, which is never drawn, and about hooks
+        warnings.simplefilter("ignore")  # Captum warns of tqdm's bar, which is never drawn, and of hooks
         from captum.attr import DeepLift
 
         for part in inputs.split(at_once(AT_ONCE, (INSIDE, *inputs.shape[1:]))):
@@ -169,11 +196,11 @@ def _deep_lift(
 
 
 def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
-    """A member's log-odds (n, 1) on (n, C, H, W), as a chain of modules for which Captum's rules are valid.
+    """Return a network that gives the log-odds (n, 1) of inputs (n, C, H, W), built so that Captum's rules are valid.
 
-    Its rule for max pooling credits a pixel for the last window that it is the maximum of, and loses its credit for the
-    others; DoorKey's windows overlap. So each window gets a copy of its pixels, which is linear, and the maximum is
-    taken over separate windows. ``example`` is an input, from which shapes follow.
+    Captum's rule for max pooling credits a pixel only for the last window of which the pixel is the maximum. So credit
+    for the other windows is lost, and DoorKey's windows overlap. To mend that, each window gets a copy of its pixels,
+    which is linear, and the maximum is taken over separate windows. ``example`` is an input, from which shapes follow.
     """
     layers = []
     values = example
@@ -192,13 +219,13 @@ def attributable(network: nn.Module, example: Tensor) -> nn.Sequential:
 
 
 def _separable(layer: nn.Module) -> bool:
-    """Whether it is a pooling whose windows can be separated."""
+    """Say whether ``layer`` is a max pooling whose windows can be separated."""
     return isinstance(layer, nn.MaxPool2d) and not layer.ceil_mode and layer.padding == 0 and layer.dilation == 1
 
 
 class _LogOdds(nn.Module):
-    """Logits (n, 2) -> log-odds (n, 1)."""
+    """A layer from logits (n, 2) to log-odds (n, 1)."""
 
     def forward(self, logits: Tensor) -> Tensor:
-        """The difference of the logits."""
+        """Return the positive logit minus the negative logit."""
         return logits[:, 1:] - logits[:, :1]

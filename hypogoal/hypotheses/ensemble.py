@@ -1,4 +1,4 @@
-"""An ensemble of K members, each a hypothesis about the features that make a sub-goal, and its file."""
+"""An ensemble of K members, and its file. Each member is a hypothesis about the features that make a sub-goal."""
 
 import copy
 import os
@@ -20,9 +20,9 @@ from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.hypotheses.views import FullView, View, view_of
 from hypogoal.observations import NUMBERS, Observations, Shape, packed, type_of, type_text, values_in
 
-THRESHOLD = 0.5  # of the probability, unless another is set
-IMAGES_AT_ONCE = 64  # in a plain forward pass, to fit a CPU's cache; on a GPU 16 times as many
-PATCH_CHUNK = 4096  # images with few distinct patches
+THRESHOLD = 0.5  # the probability above which a prediction is positive, unless another threshold is set
+IMAGES_AT_ONCE = 64  # images in a plain forward pass that fit a CPU's cache; a GPU takes 16 times as many
+PATCH_CHUNK = 4096  # images in a pass if they have few distinct patches
 FOLD_FROM = 32  # images from which folding BatchNorm into the convolutions pays
 PATCHES_FROM = 256  # images from which looking for distinct patches pays
 
@@ -32,30 +32,33 @@ if os.name == "posix":  # a forked process has none of its parent's threads, for
 
 @contextmanager
 def predicting(device: torch.device) -> Iterator[None]:
-    """Within the block without gradients, and in float32 whatever autocast is around."""
+    """Turn gradients and autocast off within the block, so that predictions are computed in float32."""
     kind = "cuda" if device.type == "cuda" else "cpu"
     with torch.inference_mode(), torch.autocast(kind, enabled=False):
         yield
 
 
 class Ensemble(nn.Module):
-    """K member networks of one sub-goal with fresh weights; a ``training.EnsembleTraining`` trains them.
+    """K member networks of one sub-goal.
+
+    A new ensemble has random weights, which a ``training.EnsembleTraining`` trains.
 
     Args:
-        network: a name in ``networks.NETWORKS``.
-        observation_shape: of one observation, (H, W, C) for pictures.
-        members: K, at least 1.
-        generator: draws the initial weights.
-        view: what members see of an observation; None: a whole picture.
+        network: the name of a network in ``networks.NETWORKS``.
+        observation_shape: the shape of one observation, (H, W, C) for pictures.
+        members: K, the number of members, at least 1.
+        generator: the random generator that draws the initial weights.
+        view: what members see of an observation. With None, members see a whole picture.
 
     Attributes:
-        members: K ``nn.Sequential``, from ``networks.inputs_of`` the view (for pictures float (N, C, h, w) in 0..1)
-            to logits (N, 2).
-        networks: the members with their layers in the fastest order; weights and BatchNorm statistics are shared.
-        thresholds: float32 (K,), the probabilities above which members' predictions are positive.
+        members: K ``nn.Sequential``, each a function from ``networks.inputs_of`` the view (for pictures float (N, C, h,
+            w) in 0..1) to logits (N, 2).
+        networks: the members with their layers in the fastest order. They share weights and BatchNorm statistics with
+            ``members``.
+        thresholds: float32 (K,), the probabilities above which the members' predictions are positive.
 
     Raises:
-        UserError: unknown network, or images too small for it.
+        UserError: if the network is unknown, or if images are too small for it.
     """
 
     thresholds: Tensor
@@ -93,17 +96,21 @@ class Ensemble(nn.Module):
         return f"Ensemble({len(self)} members, network {self.network!r}, observations {kind} {self.observation_shape})"
 
     def __len__(self) -> int:
-        """K, the number of members."""
+        """Return K, the number of members."""
         return len(self.members)
 
     def thresholds_as_log_odds(self) -> Floats:
-        """The thresholds (K,) as log-odds, with the same predictions up to rounding."""
+        """Return the thresholds as log-odds, float32 (K,). Up to rounding, predictions by log-odds do not differ."""
         return log_odds_of(self.thresholds.cpu().numpy()).astype(np.float32)
 
     def see(self, observations: Observations) -> Any:
-        """The members' view of observations uint8 (N, H, W, C): uint8 (N, h, w, C); see :meth:`predict`.
+        """Return what the members see of observations.
 
-        For observations other than pictures: float32 (N, *shape), standardised; mixed ones (N,), their numbers so.
+        Takes the observations that :meth:`predict` takes, and raises ``UserError`` where :meth:`predict` does.
+
+        Returns:
+            For pictures uint8 (N, H, W, C): uint8 (N, h, w, C). For numbers: float32 (N, *shape), standardised. For
+            mixed observations: an array (N,) with a field for each key, in which the numbers are standardised.
         """
         dtype = self.view.dtype
         expected = f"{type_text(dtype)} (N, {', '.join(map(str, self.observation_shape))})"
@@ -115,40 +122,48 @@ class Ensemble(nn.Module):
                 observations = observations.astype(NUMBERS)
             if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
                 raise ValueError(f"{observations.dtype} {observations.shape}")
-        except ValueError as error:  # also of other keys, or of states of different shapes
+        except ValueError as error:  # also raised for other keys, and for states of different shapes
             raise UserError("these observations do not fit the ensemble", error, f"Give {expected}.") from None
         return np.ascontiguousarray(self.view.see(observations))  # torch takes no flipped arrays
 
     def predictions(self, observations: Observations) -> Bools:
-        """Every member's prediction, whether the sub-goal holds: bool (N, K); see :meth:`predict`.
+        """Return whether the sub-goal holds according to every member, bool (N, K).
 
-        Within rounding of its threshold, some 1e-6, a prediction may depend on the other states of the call.
+        Takes the observations that :meth:`predict` takes, and raises ``UserError`` where :meth:`predict` does. If a
+        probability is within rounding of its threshold, about 1e-6, the prediction may depend on the other states of
+        the call.
         """
         return self.predict(observations) > self.thresholds.cpu().numpy()
 
     def predict(self, observations: Observations) -> Floats:
-        """Every member's probability that the sub-goal holds.
+        """Return every member's probability that the sub-goal holds.
 
         Args:
-            observations: uint8 (N, H, W, C), or float32 of any shape, as in training; or a list of N. Mixed ones: a
-                dictionary of such arrays.
+            observations: uint8 (N, H, W, C) for pictures, or float32 (N, ...) of the shape used in training, or a list
+                of N observations. Mixed observations are a dictionary of such arrays.
 
         Returns:
-            float32 (N, K). Up to rounding, a state's row does not depend on the others.
+            float32 (N, K). Up to rounding, the probabilities of a state do not depend on the other states.
 
         Raises:
-            UserError: observations of another shape or type.
+            UserError: if the observations have another shape or type than in training.
         """
         both = torch.from_numpy(self.logits(observations))
         return np.asarray(both.softmax(dim=-1)[..., 1])
 
     def log_odds(self, observations: Observations) -> Floats:
-        """Every member's log-odds that the sub-goal holds: float32 (N, K); see :meth:`predict`."""
+        """Return every member's log-odds that the sub-goal holds, float32 (N, K).
+
+        Takes the observations that :meth:`predict` takes, and raises ``UserError`` where :meth:`predict` does.
+        """
         both = self.logits(observations)
         return both[..., 1] - both[..., 0]
 
     def logits(self, observations: Observations) -> Floats:
-        """Every member's logits of negative and positive: float32 (N, K, 2); see :meth:`predict`."""
+        """Return every member's logits for negative and positive, float32 (N, K, 2).
+
+        Takes the observations that :meth:`predict` takes, and raises ``UserError`` where :meth:`predict` does.
+        """
         seen = self.see(observations)
         device = self.thresholds.device
         size = PATCH_CHUNK if device.type == "cpu" else IMAGES_AT_ONCE * 16
@@ -167,11 +182,19 @@ class Ensemble(nn.Module):
         observations: Observations,
         against: Observations,
     ) -> Floats:
-        """Figure 2: what each member looks at in observations, see :mod:`hypogoal.hypotheses.deep_lift`.
+        """Return what each member looks at in the observations (Figure 2), see :mod:`hypogoal.hypotheses.deep_lift`.
 
-        The baseline is the mean of ``against``: other observations, for example unlabelled ones. Returns float32
-        (N, K, *the shape of the view; (H, W, C) for pictures) in log-odds: a state's sum is its log-odds minus the
-        baseline's. Of mixed observations (N, K), with a field for each key. ``UserError`` as for :meth:`predict`.
+        Args:
+            observations: the N observations to explain, as for :meth:`predict`.
+            against: other observations, for example unlabelled ones. Their mean is the baseline.
+
+        Returns:
+            float32 (N, K, H, W, C) for pictures, else (N, K, *the shape of the view), in log-odds. A state's
+            attributions sum to the state's log-odds minus the log-odds of the baseline. For mixed observations the
+            array is (N, K), with a field for each key.
+
+        Raises:
+            UserError: if the observations have another shape or type than in training.
         """
         seen = self.see(observations)
         baseline = deep_lift.mean_state(self.see(against))
@@ -180,7 +203,7 @@ class Ensemble(nn.Module):
         return deep_lift.by_key(values, self.view.dtype) if self.view.dtype.names else values
 
     def _logits(self, observations: Observations) -> Tensor:
-        """Logits (K, N, 2); computes each distinct patch once if that pays."""
+        """Return logits (K, N, 2). Each distinct patch is computed once if that is faster."""
         members, device = self.networks, self.thresholds.device
         count = size = len(observations)
         if device.type == "cpu" and count >= PATCHES_FROM:
@@ -203,7 +226,10 @@ class Ensemble(nn.Module):
 
 
 def together(ensembles: Sequence[Ensemble]) -> Ensemble | None:
-    """All members of ensembles with one network as one, in order; None unless all see whole pictures alone."""
+    """Join ensembles with one network: return an ensemble of all their members, in order.
+
+    Returns None if any of the ensembles has a view of its own or standardises numbers.
+    """
     first = ensembles[0]
     if any(type(each.view) is not FullView or each.view.standard is not None for each in ensembles):
         return None
@@ -220,7 +246,7 @@ def write_ensemble(
     sub_goal: str,
     ensemble: Ensemble,
 ) -> None:
-    """Write ``<sub-goal>.safetensors`` to ``folder``."""
+    """Write ``ensemble`` to ``<sub-goal>.safetensors`` in ``folder``."""
     save_tensors(folder / f"{sub_goal}.safetensors", ensemble.state_dict())
 
 
@@ -229,9 +255,10 @@ def read_ensemble(
     config: Mapping[str, Any],
     sub_goal: str,
 ) -> Ensemble:
-    """One sub-goal's ensemble, from an ensemble artefact's folder and its manifest's configuration; to predict with.
+    """Return the ensemble of one sub-goal, ready to predict.
 
-    An unknown sub-goal, or missing or damaged weights, are a ``UserError``.
+    ``folder`` is the folder of an ensemble artefact, and ``config`` is the configuration in the artefact's manifest.
+    Raises ``UserError`` if the sub-goal is unknown, or if the weights are missing or damaged.
     """
     if sub_goal not in config["sub_goals"]:
         raise UserError(

@@ -1,4 +1,7 @@
-"""Which unlabelled states to label next: those where members disagree, common ones, unlike each other."""
+"""Choice of the unlabelled states to label next.
+
+States are chosen on which members disagree, and that are common and unlike each other.
+"""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -18,17 +21,22 @@ from hypogoal.observations import (
     standardised,
 )
 
-GRID = 16  # areas along a side of a picture, whose means are compared
-DIRECTIONS = 16  # of the states' largest variance
-NEIGHBOURS = 10  # whose distance says how dense states are
-SAMPLE = 500  # states whose usual distance is taken
-COMPARED = 4_000  # unlabelled states, spread over the file
+GRID = 16  # a picture is compared by the means of GRID x GRID areas
+DIRECTIONS = 16  # the number of directions of largest variance that a sketch keeps
+NEIGHBOURS = 10  # the number of nearest states whose distance says how dense states are
+SAMPLE = 500  # the number of states from which the usual distance is computed
+COMPARED = 4_000  # the largest number of unlabelled states that are compared, spread over the file
 
 
 def next_to_label(states: Observations, scores: Floats, thresholds: Doubles, count: int) -> tuple[Ints, Doubles]:
-    """Which of unlabelled states (N, *obs) to label next, best first, and how much members differ there.
+    """Choose ``count`` of the unlabelled states (N, *obs) to label next.
 
-    Those where ``scores`` (N, K) differ much, that are common and unlike those before; among ``COMPARED`` at most.
+    States are proposed where the members' ``scores``, probabilities (N, K), differ much. Proposed states are common,
+    and unlike the states proposed before. At most ``COMPARED`` of the states are looked at. ``thresholds`` (K,) are the
+    members' thresholds.
+
+    Returns:
+        The indices of the proposed states, best first, int64 (n,), and how much members differ there, float64 (n,).
     """
     compared = spread_rows(len(states), COMPARED)
     sketches = sketches_of(states[compared])
@@ -38,9 +46,10 @@ def next_to_label(states: Observations, scores: Floats, thresholds: Doubles, cou
 
 
 def sketches_of(observations: Observations) -> Doubles:
-    """Observations (N, *obs) as few numbers (N, D), alike where states look alike: the directions of largest variance.
+    """Return sketches, float64 (N, D): few numbers for each observation, alike where the states look alike.
 
-    A picture counts as much as all numbers together.
+    A sketch is the projection of an observation onto the directions of largest variance. A picture counts as much as
+    all numbers together.
     """
     numbers = numbers_of(observations)
     parts = [standardised(numbers, *standard_of(numbers.shape[1:], numbers))]
@@ -58,9 +67,11 @@ def sketches_of(observations: Observations) -> Doubles:
 
 
 def disagreement(probabilities: Floats, thresholds: Doubles) -> Doubles:
-    """How much members' predictions (N, K) differ, 0 to 1: the mean over pairs, each about its own threshold (K,).
+    """Return how much the members' probabilities (N, K) differ, 0 to 1, float64 (N,).
 
-    Of one member, which cannot disagree, its own prediction, 0.5 at its threshold: the more, the more a policy is paid.
+    The disagreement is the mean over pairs of members, and each member's probability is taken relative to the member's
+    own threshold (K,). A single member cannot disagree. For a single member the result is its probability, shifted to
+    be 0.5 at the threshold, because a policy is paid more the higher that probability is.
     """
     centred = expit(log_odds_of(probabilities) - log_odds_of(thresholds))
     if centred.shape[1] == 1:
@@ -70,7 +81,10 @@ def disagreement(probabilities: Floats, thresholds: Doubles) -> Doubles:
 
 
 def density_of(sketches: Doubles) -> Doubles:
-    """How common each state is (N,): 1 where its ten nearest are as far as usual, up to e where they are nearer."""
+    """Return how common each state is, float64 (N,).
+
+    The density is 1 where the ten nearest states are as far away as usual, and rises to e where they are nearer.
+    """
     neighbours = min(NEIGHBOURS + 1, len(sketches))
     distances, _ = KDTree(sketches).query(sketches, [*range(1, neighbours + 1)])
     near = distances.mean(axis=1)
@@ -78,9 +92,11 @@ def density_of(sketches: Doubles) -> Doubles:
 
 
 def to_label(scores: Doubles, sketches: Doubles, count: int) -> Ints:
-    """The rows of ``count`` states to label next, best first: with a high score, and unlike those before.
+    """Return the indices of ``count`` states to label next, best first, int64 (n,).
 
-    The score (N,), at least 0, times how far the nearest row before is: 0 there, 1 at the usual distance of two states.
+    States are picked that have a high score and are unlike the states picked before. The score (N,), at least 0, is
+    multiplied by a number that grows with the distance to the nearest picked state: 0 at no distance, 0.63 at the usual
+    distance of two states, 1 far away.
     """
     some = sketches[spread_rows(len(sketches), SAMPLE)]
     usual = np.median(cdist(some, some)) or 1.0

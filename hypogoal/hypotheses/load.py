@@ -1,4 +1,4 @@
-"""Members of a sub-goal, with torch and safetensors alone: ``load("door-open")(observations)`` -> P (N, K)."""
+"""Loading of a sub-goal's members with torch and safetensors alone: ``load("door-open")(observations)`` -> P (N, K)."""
 
 import json
 from collections.abc import (
@@ -13,11 +13,11 @@ import torch
 from safetensors.torch import load_file
 
 HERE = Path(__file__).parent
-DEVIATIONS = 10.0  # numbers are clipped this far from their mean
+DEVIATIONS = 10.0  # numbers are clipped at this many standard deviations from their mean
 
 
 class ByKey(torch.nn.Module):
-    """An encoder for each key of mixed observations: inputs of all keys in a row, (N, D) -> their outputs (N, F)."""
+    """One encoder for each key of mixed observations: from all keys' numbers in a row (N, D) to features (N, F)."""
 
     def __init__(
         self,
@@ -28,7 +28,7 @@ class ByKey(torch.nn.Module):
         self.shapes, self.encoders = shapes, torch.nn.ModuleList(encoders)
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
-        """Encode each key's part."""
+        """Encode the part of each key, and return the features of all keys in a row, (N, F)."""
         sizes = [torch.Size(shape).numel() for shape in self.shapes]
         parts = values.split(sizes, dim=1)
         encoded = []
@@ -43,7 +43,7 @@ class ByKey(torch.nn.Module):
 
 
 def built(layers: list[Any]) -> torch.nn.Sequential:
-    """A network from the names and arguments of its layers."""
+    """Return a network with the layers whose names and arguments are given."""
     network = torch.nn.Sequential()
     for kind, arguments in layers:
         if kind == "ByKey":
@@ -56,9 +56,10 @@ def built(layers: list[Any]) -> torch.nn.Sequential:
 
 
 def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
-    """A function from observations (N, ...), or such arrays by key, to members' probabilities, float32 (N, K).
+    """Return a function from observations to the members' probabilities, float32 (N, K).
 
-    They are of the type and shape of training: pictures are bytes. Others are a ``ValueError``.
+    The function takes an array (N, ...), or a dictionary of such arrays by key, of the type and shape of training.
+    Pictures are bytes. The function raises ``ValueError`` for other observations.
     """
     config = json.loads((HERE / "config.json").read_bytes())
     state = load_file(HERE / f"{sub_goal}.safetensors")
@@ -76,7 +77,7 @@ def load(sub_goal: str) -> Callable[[Any], torch.Tensor]:
         for key, (kind, shape) in config["observations"].items():
             values = observations[key] if key else observations
             if not isinstance(values, torch.Tensor):
-                import numpy  # without which torch takes no arrays
+                import numpy  # torch takes no arrays without numpy
 
                 values = torch.from_numpy(numpy.array(values, order="C"))
             values = values.cpu() if kind == "uint8" else values.cpu().float()

@@ -1,13 +1,13 @@
 """Member networks, chosen by name.
 
-Each is an ``nn.Sequential`` from :func:`inputs_of`, for pictures float (N, C, H, W) in 0..1, to logits (N, 2), with
-"positive" in column 1. Built-in networks consist of plain modules used once, each ReLU before its MaxPool: DeepLift is
-valid for no others. :func:`reordered` has an order that is faster to train. A user's network may begin with any module,
-an encoder.
+Each network is an ``nn.Sequential`` from :func:`inputs_of`, for pictures float (N, C, H, W) in 0..1, to logits (N, 2),
+with "positive" in column 1. Built-in networks consist of plain modules, each used once, with each ReLU before its
+MaxPool, because DeepLift is valid for such networks only. :func:`reordered` gives an order that is faster to train. A
+user's network may begin with any module, an encoder.
 
-The paper states the number and kinds of layers, not their sizes. These come from the authors' public code
-(github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models), without its dropout of 0.1 in DoorKey's
-network, which the paper does not have.
+The paper states the number and kinds of layers, but not their sizes. The sizes come from the authors' public code
+(github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models). The dropout of 0.1 in DoorKey's network
+there is left out, because the paper does not have it.
 """
 
 import inspect
@@ -29,11 +29,11 @@ from hypogoal.observations import PICTURE, DType, Observations, Shape, fields_of
 
 CLASSES = 2
 AUTO = "auto"  # the network that suits the observations
-LEAST = {"doorkey": 41, "montezuma": 36, "tiles": 24}  # pixels of a picture's shorter side
+LEAST = {"doorkey": 41, "montezuma": 36, "tiles": 24}  # the fewest pixels of a picture's shorter side
 OTHERWISE = "mlp"
 JOINT = 256  # units of the dense layer that joins the keys of mixed observations
-Parts = tuple[list[nn.Module], tuple[int, ...]]  # convolutional part, widths of hidden dense layers
-MOST_NUMBERS = 2**24  # in the states of one pass without gradients: some 400 MB inside a network
+Parts = tuple[list[nn.Module], tuple[int, ...]]  # the convolutional layers, and the widths of hidden dense layers
+MOST_NUMBERS = 2**24  # numbers in the states of one pass without gradients, which take some 400 MB inside a network
 ENTRY_POINTS = "hypogoal.networks"  # with which other packages add networks
 
 
@@ -43,7 +43,7 @@ def _convolution(
     kernel: int,
     stride: int,
 ) -> list[nn.Module]:
-    """A convolution, BatchNorm, ReLU."""
+    """Return a convolution, BatchNorm and ReLU."""
     layer = nn.Conv2d(
         channels,
         features,
@@ -55,9 +55,10 @@ def _convolution(
 
 
 def doorkey(channels: int) -> Parts:
-    """DoorKey, two convolutions (+ BatchNorm + ReLU) and three dense layers; from 41x41 pixels.
+    """Return DoorKey's layers: two convolutions (+ BatchNorm + ReLU), for three dense layers behind them.
 
-    Source: the paper's appendix; sizes from the authors' code (minigrid_cnn.py).
+    Pictures need at least 41x41 pixels. Source: the paper's appendix. The sizes are from the authors' code
+    (minigrid_cnn.py).
     """
     layers = [
         *_convolution(channels, 32, 5, 2),
@@ -69,9 +70,10 @@ def doorkey(channels: int) -> Parts:
 
 
 def montezuma(channels: int) -> Parts:
-    """Montezuma, three convolutions (+ BatchNorm + ReLU) and two dense layers; from 36x36 pixels.
+    """Return Montezuma's layers: three convolutions (+ BatchNorm + ReLU), for two dense layers behind them.
 
-    Source: the paper's appendix; sizes from the authors' code (monte_cnn.py).
+    Pictures need at least 36x36 pixels. Source: the paper's appendix. The sizes are from the authors' code
+    (monte_cnn.py).
     """
     layers = [
         *_convolution(channels, 32, 8, 4),
@@ -82,7 +84,10 @@ def montezuma(channels: int) -> Parts:
 
 
 def tiles(channels: int) -> Parts:
-    """Pictures of 8x8 tiles: a layer that reads tiles, one of 3x3 tiles, a hidden dense layer; from 24x24 pixels."""
+    """Return layers for pictures made of 8x8 tiles, of at least 24x24 pixels.
+
+    The first layer reads single tiles, the second layer reads 3x3 tiles, and a hidden dense layer follows.
+    """
     layers = [
         *_convolution(channels, 16, 8, 8),
         *_convolution(16, 16, 3, 1),
@@ -91,7 +96,7 @@ def tiles(channels: int) -> Parts:
 
 
 def mlp(channels: int) -> Parts:
-    """Two hidden dense layers, for observations of any shape."""
+    """Return no convolutions and two hidden dense layers, for observations of any shape."""
     return [], (256, 256)
 
 
@@ -105,10 +110,10 @@ NETWORKS = {
 
 
 def network_for(name: str, shape: Shape, dtype: DType) -> str:
-    """Resolve ``auto`` by the shape and type of observations; any other name stays.
+    """Replace the name ``auto`` by the network that suits the shape and type of observations. Keep any other name.
 
-    Of mixed observations the names by key, ``front=doorkey,state=mlp``. A name without a key is for all pictures; a
-    key that they lack is a ``UserError``.
+    For mixed observations, return the names by key, such as ``front=doorkey,state=mlp``. A name without a key is for
+    all pictures. Raises ``UserError`` if ``name`` has a key that the observations lack.
     """
     if not dtype.names:
         return _suitable(shape, dtype) if name == AUTO else name
@@ -130,7 +135,7 @@ def network_for(name: str, shape: Shape, dtype: DType) -> str:
 
 
 def _suitable(shape: Shape, dtype: DType) -> str:
-    """The network for pictures of this size, or for numbers."""
+    """Return the name of the network for pictures of this size, or for numbers."""
     if dtype == PICTURE:
         for network, least in LEAST.items():
             if min(shape[:2]) >= least:
@@ -139,16 +144,15 @@ def _suitable(shape: Shape, dtype: DType) -> str:
 
 
 def names_in(network: str) -> list[str]:
-    """The names of networks in a setting, which may have one for each key."""
+    """Return the names of networks in a setting, which may have one name for each key."""
     return [part.strip().rpartition("=")[2] for part in network.split(",")]
 
 
 def load_network(name: str) -> Callable[[Shape], Parts]:
-    """A function from an observation shape to network ``name``: of :data:`NETWORKS`, an entry point, or
-    ``module:function``.
+    """Return the function that builds network ``name`` for an observation shape.
 
-    An unknown network, one that cannot be loaded, or code that the user did not allow (see
-    :mod:`hypogoal.core.own_code`) is a ``UserError``.
+    ``name`` is one of :data:`NETWORKS`, an installed entry point, or ``module:function``. Raises ``UserError`` if the
+    network is unknown or cannot be loaded, or if the user did not allow the code (see :mod:`hypogoal.core.own_code`).
     """
     built_in = dict.fromkeys(NETWORKS, __name__)
     function: Any = NETWORKS.get(name) or load(name, "network", ENTRY_POINTS, built_in)
@@ -170,7 +174,7 @@ def load_network(name: str) -> Callable[[Shape], Parts]:
 
 
 def _layers(name: str, network: Any) -> Parts:
-    """A user's parts, if they are some."""
+    """Return the layers and widths that a user's function gave. Raises ``UserError`` if they are something else."""
     try:
         layers, hidden = network
         widths = tuple(map(int, hidden))
@@ -192,12 +196,20 @@ def build_network(
     generator: torch.Generator | None,
     dtype: DType = PICTURE,
 ) -> nn.Sequential:
-    """A member network, :func:`as_input` -> logits (N, 2), on the CPU, for observations of this shape.
+    """Build a member network on the CPU: from :func:`as_input` of observations to logits (N, 2).
 
-    ``generator`` draws the initial weights (PyTorch's default distributions); None: that of the ``DrawsFrom`` around.
-    Of mixed observations, of type ``dtype``, each key has its network without the last layer; a dense layer joins them.
-    An unknown network (see :func:`load_network`), or observations that it does not take, for example images too small
-    for it, are a ``UserError``.
+    For mixed observations, each key has its own network without the last layer, and a dense layer joins the networks.
+
+    Args:
+        name: the name of the network, see :func:`load_network`.
+        observation_shape: the shape of one observation.
+        generator: the random generator that draws the initial weights, by PyTorch's default distributions. With None,
+            the generator of the surrounding ``DrawsFrom`` draws.
+        dtype: the type of observations.
+
+    Raises:
+        UserError: if the network is unknown, or does not take the observations, for example because images are too
+            small.
     """
     by_key = _by_key(name, generator, dtype) if dtype.names else None
     example = torch.zeros(1, values_in((), dtype)) if by_key else as_input(torch.zeros(1, *observation_shape))
@@ -217,7 +229,7 @@ def _by_key(
     generator: torch.Generator | None,
     dtype: DType,
 ) -> ByKey:
-    """The encoders of mixed observations."""
+    """Build the encoders of mixed observations."""
     shapes, encoders = [], []
     names = names_in(network_for(name, (), dtype))
     for of_key, (_, shape) in zip(names, fields_of((), dtype).values(), strict=True):
@@ -227,8 +239,8 @@ def _by_key(
 
 
 def _features(name: str, layers: Iterable[nn.Module], example: Tensor, shape: Shape) -> int:
-    """How many features a convolutional part makes of an input; a ``UserError`` where it makes none of such a shape."""
-    changes = example._version  # counts what is done in place
+    """Return how many features a convolutional part makes of an input. Raises ``UserError`` if the part makes none."""
+    changes = example._version  # PyTorch counts the operations that changed the tensor in place
     try:
         with torch.no_grad():
             features = nn.Sequential(*layers).eval()(example)
@@ -250,10 +262,10 @@ def _features(name: str, layers: Iterable[nn.Module], example: Tensor, shape: Sh
 
 
 def reordered(network: nn.Sequential) -> nn.Sequential:
-    """The same function with each ReLU after its MaxPool, which keeps less; modules with weights are shared.
+    """Return a network of the same function with each ReLU after its MaxPool, so that fewer activations are kept.
 
-    ReLU is monotone, so the order changes neither values nor gradients, but behind the pooling it has a quarter of the
-    work. Only attribution needs the other order.
+    Modules with weights are shared with ``network``. ReLU is monotone, so the order changes neither values nor
+    gradients. Behind the pooling, ReLU has a quarter of the work. Only attribution needs the other order.
     """
     layers: list[nn.Module] = []
     for layer in network:
@@ -268,7 +280,10 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
 
 
 def folded(network: nn.Sequential) -> nn.Sequential:
-    """The same function in evaluation mode, each BatchNorm folded into (a copy of) the convolution before it."""
+    """Return a network of the same function in evaluation mode, with BatchNorm folded into convolutions.
+
+    Each BatchNorm is folded into a copy of the convolution before it.
+    """
     layers: list[nn.Module] = []
     for layer in network:
         before = layers[-1] if layers else None
@@ -280,16 +295,19 @@ def folded(network: nn.Sequential) -> nn.Sequential:
 
 
 def as_input(observations: Tensor) -> Tensor:
-    """uint8 (N, H, W, C) -> float32 (N, C, H, W) in 0..1, in the same memory order (channels last).
+    """Convert pictures uint8 (N, H, W, C) to float32 (N, C, H, W) in 0..1, in the same memory order (channels last).
 
-    Other observations stay as they are, except that the last axis of (N, H, W, C) moves to the front, too.
+    Other observations keep their values. If they have the shape (N, H, W, C), their last axis moves to the front, too.
     """
     ordered = observations.permute(0, 3, 1, 2) if observations.ndim == 4 else observations
     return ordered.to(torch.float32).div_(255.0) if observations.dtype == torch.uint8 else ordered
 
 
 def inputs_of(observations: Observations, device: torch.device | str = "cpu") -> Tensor:
-    """What networks take of observations (N, ...), see :func:`as_input`; of mixed ones all keys' in a row, (N, D)."""
+    """Return what networks take of observations (N, ...), see :func:`as_input`.
+
+    For mixed observations, return the numbers of all keys in a row, (N, D).
+    """
     if not observations.dtype.names:
         return as_input(torch.from_numpy(observations).to(device))
     parts = []
@@ -300,5 +318,5 @@ def inputs_of(observations: Observations, device: torch.device | str = "cpu") ->
 
 
 def at_once(most: int, shape: Shape) -> int:
-    """How many states of this shape to pass through a network at once: ``most``, or fewer if they are large."""
+    """Return how many states of ``shape`` may pass a network at once: ``most``, or fewer if states are large."""
     return max(1, min(most, MOST_NUMBERS // prod(shape)))

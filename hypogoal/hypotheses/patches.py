@@ -1,9 +1,9 @@
 """Convolutions over images made of few distinct patches: each distinct patch is computed once.
 
-A grid world's image repeats a few tiles, so of the thousands of patches that a convolution or pooling sees in a batch
-of images, few differ. Here a layer works on a table of the distinct patches, and BatchNorm weights each by its
-frequency. Up to rounding, values, gradients and running statistics are those of the plain network, several times faster
-on a CPU.
+A grid world's image repeats a few tiles. So of the thousands of patches that a convolution or pooling sees in a batch
+of images, only few differ. The layers in this module work on a table of the distinct patches, and BatchNorm weights
+each patch by its frequency. Up to rounding, values, gradients and running statistics are those of the plain network. On
+a CPU, the computation is several times faster.
 """
 
 from collections.abc import Sequence
@@ -20,25 +20,27 @@ from torch.nn import functional
 from hypogoal.core.arrays import Array, Bytes, Ints
 from hypogoal.observations import spread_rows
 
-Ids = NDArray[np.int32]  # of patches, rows or colours
-WORTHWHILE = 0.5  # of the plain network's work in convolutions; above, gathering patches costs more than it saves
-SAMPLE = 64  # images of each part from which that is estimated,
-SAMPLE_PIXELS = 2**19  # or fewer images, within this number of pixels: each takes some 250 bytes
-LOOKUP_PER_VALUE = 4  # table entries per value to rank; beyond, sorting is faster
+Ids = NDArray[np.int32]  # numbers of patches, rows or colours
+# If distinct patches need more than this share of the plain network's work in convolutions, gathering patches costs
+# more than it saves.
+WORTHWHILE = 0.5
+SAMPLE = 64  # the number of images of each part from which the share of work is estimated
+SAMPLE_PIXELS = 2**19  # the images of a sample have at most this number of pixels, because each takes some 250 bytes
+LOOKUP_PER_VALUE = 4  # sorting is faster than a table with more than this number of entries per value to rank
 
 
 @dataclass(frozen=True)
 class Level:
     """The patches that one convolution or pooling sees in N images, by id."""
 
-    parts: Ids  # (U, k * k), each distinct patch as patch ids of the level below (colours for the first)
-    rows: Ids  # (R, W), distinct rows of places: the patch at each place
+    parts: Ids  # (U, k * k), each distinct patch as patch ids of the level below (of colours at the first level)
+    rows: Ids  # (R, W), distinct rows of places, with the patch id at each place
     lines: Ids  # (N, H), each image as indices of rows
 
 
 @dataclass(frozen=True)
 class Tables:
-    """Distinct patches of N images: colours float32 (U, C) in 0..1; a level per convolution or pooling."""
+    """The distinct patches of N images: colours float32 (U, C) in 0..1, and a level for each convolution or pooling."""
 
     colours: Tensor
     levels: tuple[Level, ...]
@@ -46,23 +48,24 @@ class Tables:
 
 @dataclass(frozen=True)
 class PatchBatch:
-    """The patches in groups of images, group after group.
+    """The patches of several groups of images, one group after another.
 
-    BatchNorm sees each group on its own; all other layers see all groups at once.
+    BatchNorm sees each group on its own. All other layers see all groups at once.
     """
 
     colours: Tensor  # float32 (colours, C)
-    parts: list[Tensor]  # for each level int64 (U, k * k), indices of the level below, at first of the colours
-    # For each level and group float32 (1, U), each patch's share of the group's places, which sum to 1; their number.
+    parts: list[Tensor]  # for each level int64 (U, k * k), indices of the level below, or of colours at the first level
+    # For each level and group: each patch's share of the group's places, float32 (1, U), which sums to 1, and the
+    # number of places.
     shares: list[list[tuple[Tensor, int]]]
     last: Tensor  # int64 (B, H * W), the last level's patch at each place of all images
 
 
 def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
-    """(kernel size, stride) of each convolution and pooling; None if a layer is not supported."""
+    """Return (kernel size, stride) of each convolution and pooling, or None if a layer is not supported."""
     windows = []
     for layer in network:
-        kind = type(layer)  # subclasses may compute otherwise
+        kind = type(layer)  # not isinstance, because a subclass may compute something else
         if kind in (nn.Conv2d, nn.MaxPool2d):
             if not _plain(layer):
                 return None
@@ -76,7 +79,7 @@ def windows_of(network: nn.Sequential) -> list[tuple[int, int]] | None:
 
 
 def _plain(layer: Any) -> bool:
-    """Whether a convolution or pooling has square windows inside the image, of all channels."""
+    """Say whether a convolution or pooling has square windows that lie inside the image and see all channels."""
     square = _side(layer.kernel_size) > 0 and _side(layer.stride) > 0
     inside = _side(layer.padding) == 0 and _side(layer.dilation) == 1
     if isinstance(layer, nn.Conv2d):
@@ -85,15 +88,15 @@ def _plain(layer: Any) -> bool:
 
 
 def _side(size: Any) -> Any:
-    """The side of a square window; -1 if it is not square."""
+    """Return the side of a square window, or -1 if the window is not square."""
     height, width = np.broadcast_to(size, 2).tolist()
     return height if height == width else -1
 
 
 def make_tables(network: nn.Sequential, *parts: Array) -> Tables | None:
-    """The distinct patches of images, uint8 (N, H, W, C), part after part, as ``network`` sees them.
+    """Return the distinct patches that ``network`` sees in images, uint8 (N, H, W, C), of one part after another.
 
-    None if too few repeat to be worthwhile, or if the network has unsupported layers.
+    Returns None if too few patches repeat to be worthwhile, or if the network has unsupported layers.
     """
     windows = windows_of(network)
     if windows is None or parts[0].dtype != np.uint8:
@@ -108,11 +111,14 @@ def make_tables(network: nn.Sequential, *parts: Array) -> Tables | None:
 
 
 def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
-    """Whether the distinct patches of a sample leave little of a plain pass's multiplications and comparisons."""
+    """Say whether computing a sample's distinct patches takes less than ``WORTHWHILE`` of the work of a plain pass.
+
+    Work is the number of multiplications and comparisons.
+    """
     tabled = plain = 0
     layers = [layer for layer in network if isinstance(layer, nn.Conv2d | nn.MaxPool2d)]
     for level, layer in zip(sample.levels, layers, strict=True):
-        work = level.parts.shape[1]  # at one place
+        work = level.parts.shape[1]  # operations at one place
         if isinstance(layer, nn.Conv2d):
             work = layer.weight.numel()
         tabled += len(level.parts) * work
@@ -124,7 +130,10 @@ def _tables(
     observations: Bytes,
     windows: Sequence[tuple[int, int]],
 ) -> Tables:
-    """The distinct patches of images, level by level: strips of distinct rows, bands of rows, then strips in bands."""
+    """Return the distinct patches of images, level by level.
+
+    At each level, the steps find strips of distinct rows, then bands of rows, then strips in bands.
+    """
     count, height, width, channels = observations.shape
     lines, pixel_rows = _distinct_items(
         observations.reshape(
@@ -152,13 +161,19 @@ def _tables(
 
 
 def _strided(values: Ids, kernel: int, stride: int) -> list[Ids]:
-    """For each offset in a window, the values (..., W) at that offset: ``kernel`` arrays (..., number of windows)."""
+    """Return ``kernel`` arrays (..., number of windows).
+
+    For each offset in a window, the array has the values (..., W) at that offset.
+    """
     after = values.shape[-1] - kernel + 1
     return [values[..., offset : after + offset : stride] for offset in range(kernel)]
 
 
 def _join(pieces: Sequence[Ids], bound: int) -> tuple[Ids, Ids]:
-    """Join pieces, of ids below ``bound``, place by place into tuples; the distinct tuples' ids, and the tuples."""
+    """Join arrays of ids below ``bound``, place by place, into tuples.
+
+    Returns the distinct tuples' ids in the shape of the arrays, and the distinct tuples.
+    """
     ids = pieces[0]
     tuples = np.arange(bound, dtype=np.int32)[:, None]
     for piece in pieces[1:]:
@@ -171,7 +186,7 @@ def _join(pieces: Sequence[Ids], bound: int) -> tuple[Ids, Ids]:
 
 
 def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
-    """Values in 0..bound-1 -> (their ranks among the distinct values, the distinct values in order)."""
+    """Return the ranks of values in 0..bound-1 among the distinct values, and the distinct values in order."""
     if bound > LOOKUP_PER_VALUE * values.size:
         ordered, inverse = np.unique(values, return_inverse=True)
         whole = inverse.reshape(values.shape)
@@ -183,7 +198,10 @@ def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
 
 
 def _distinct_items(items: Bytes) -> tuple[Ids, Bytes]:
-    """Items (N, bytes) -> (indices of distinct items (N,), the distinct items in order of appearance)."""
+    """Return the indices of distinct items (N,) and the distinct items, in order of appearance.
+
+    ``items`` are bytes (N, size).
+    """
     size = items.shape[1]
     together = np.ascontiguousarray(items).view(f"V{size}")
     whole = together.ravel().tolist()
@@ -199,13 +217,16 @@ def _distinct_items(items: Bytes) -> tuple[Ids, Bytes]:
 
 
 def take(tables: Tables, *groups: Ints) -> PatchBatch:
-    """The patches in groups of images, by index (B,); repeated images count repeatedly."""
+    """Return the patches of groups of images, given by index (B,).
+
+    Images that occur several times count several times.
+    """
     parts: list[list[Ints]] = [[] for _ in tables.levels]
     shares: list[list[tuple[Tensor, int]]] = [[] for _ in tables.levels]
-    before = [0] * len(parts)  # patches of the earlier groups, at each level
+    before = [0] * len(parts)  # at each level, the number of patches of earlier groups
     last = []
     for images in groups:
-        used = np.arange(len(tables.colours))  # ids of the level below; every group has all colours
+        used = np.arange(len(tables.colours))  # ids of the level below: at first of colours, all of which count as used
         offset = 0
         for number, level in enumerate(tables.levels):
             rows = level.lines[images]
@@ -230,7 +251,7 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
 
 
 def _positions(values: Ids, among: Ints) -> Ints:
-    """The index of each value in the sorted ``among``, which has them all."""
+    """Return the index of each value in the sorted array ``among``, which contains all of the values."""
     size = int(among[-1]) + 1
     position = np.empty(size, int)
     position[among] = np.arange(len(among))
@@ -242,11 +263,11 @@ def forward(
     batch: PatchBatch,
     counted: bool = True,
 ) -> Tensor:
-    """The logits (B, 2) of ``network`` for the images of ``batch``, in training or evaluation mode.
+    """Return the logits (B, 2) of ``network`` for the images of ``batch``, in training or evaluation mode.
 
-    Of a network without dense layers the last level's patches, (U, C), which ``batch.last`` places in the images.
-    ``windows_of`` must support its layers. In training mode, BatchNorm's running statistics include the first group,
-    and the others where they are ``counted``.
+    ``windows_of`` must support the network's layers. If the network has no dense layers, the result is the last level's
+    patches (U, C), which ``batch.last`` places in the images. In training mode, BatchNorm's running statistics include
+    the first group, and include the other groups if they are ``counted``.
     """
     rows, level = batch.colours, -1
     for layer in network:
@@ -257,7 +278,7 @@ def forward(
             if isinstance(layer, nn.Conv2d):
                 rows = _convolved(layer, windows)
             elif torch.is_grad_enabled():
-                rows = windows.max(dim=1).values  # of equals the gradient goes to the first
+                rows = windows.max(dim=1).values  # the gradient goes to the first of equal maxima
             else:
                 rows = windows.amax(dim=1)  # the same values in a third of the time
         elif isinstance(layer, nn.BatchNorm2d):
@@ -273,7 +294,7 @@ def forward(
 
 
 def _convolved(layer: nn.Conv2d, windows: Tensor) -> Tensor:
-    """A convolution of windows (U, k * k, C) -> (U, features)."""
+    """Convolve windows (U, k * k, C) to features (U, features)."""
     ordered = layer.weight.permute(2, 3, 1, 0)
     weight = ordered.reshape(-1, layer.out_channels)
     return functional.linear(windows.flatten(1), weight.T, layer.bias)
@@ -285,7 +306,10 @@ def _batch_norm(
     shares: Sequence[tuple[Tensor, int]],
     counted: bool,
 ) -> Tensor:
-    """BatchNorm of rows (U, C), group after group; each row is weighted by its share of its group's places."""
+    """Apply BatchNorm to rows (U, C), group after group.
+
+    Each row is weighted by its share of its group's places.
+    """
     if not layer.training:
         scale = layer.weight * torch.rsqrt(layer.running_var + layer.eps)
         return torch.addcmul(layer.bias - layer.running_mean * scale, rows, scale)

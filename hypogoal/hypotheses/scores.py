@@ -1,4 +1,7 @@
-"""How well members predict the true sub-goal, also whatever their thresholds, and how they differ."""
+"""Scores that say how well members predict the true sub-goal, and how much members differ.
+
+Some scores take members' predictions at their thresholds, others do without thresholds.
+"""
 
 import math
 
@@ -6,14 +9,14 @@ import numpy as np
 
 from hypogoal.core.arrays import Array, Bools, Doubles, Floats, Ints
 
-SAME = 0.99  # of unlabelled states: a member that predicts so many as another one does is no other hypothesis
+SAME = 0.99  # two members that agree on this share of unlabelled states are counted as one hypothesis
 
 
 def member_scores(predictions: Bools, labels: Bools) -> dict[str, Doubles]:
-    """Every member's scores by name, fractions float64 (K,), from predictions (N, K) and labels (N,).
+    """Return every member's scores by name, fractions float64 (K,), from predictions (N, K) and labels (N,).
 
-    Undefined scores are NaN: recall without positives, balanced accuracy without positives or negatives, precision
-    without positive predictions, any score without states.
+    A score that is undefined is NaN. Recall is undefined without positives, and balanced accuracy without positives or
+    negatives. Precision is undefined without positive predictions, and every score is undefined without states.
     """
     truth = labels.astype(bool)[:, None]
     hits = (predictions & truth).sum(0)
@@ -33,25 +36,37 @@ def member_scores(predictions: Bools, labels: Bools) -> dict[str, Doubles]:
 
 
 def ranking(probabilities: Floats, labels: Bools) -> Doubles:
-    """The area under the ROC curve: how well members rank positives above negatives, whatever their thresholds.
+    """Return the area under the ROC curve: how well members rank positives above negatives, without any threshold.
 
-    Takes probabilities (N, K) and labels (N,). Returns float64 (K,): the share of pairs of a positive and a negative in
-    which the positive has the higher probability, ties counted half; NaN without such pairs.
+    Args:
+        probabilities: the members' probabilities, float (N, K).
+        labels: whether the sub-goal holds, bool (N,).
+
+    Returns:
+        float64 (K,): the share of pairs of a positive and a negative in which the positive has the higher probability.
+        Ties count half. NaN if there are no such pairs.
     """
-    from pandas import DataFrame  # takes longer to import than training needs it
+    from pandas import DataFrame  # imported here, because the import is slow and training does without pandas
 
     positives = labels.sum()
     pairs = positives * (~labels).sum()
-    ranks = DataFrame(probabilities).rank().to_numpy()  # from 1 on, of equals the mean
+    ranks = DataFrame(probabilities).rank().to_numpy()  # ranks begin at 1, and equal values get their mean rank
     won = ranks[labels].sum(0) - positives * (positives + 1) / 2
     return ratio(won, pairs)
 
 
 def best_threshold(probabilities: Floats, labels: Bools) -> tuple[Floats, Doubles]:
-    """Each member's best threshold for the true sub-goal, and its balanced accuracy there.
+    """Return each member's best threshold for the true sub-goal, and the balanced accuracy at that threshold.
 
-    It is chosen on the labels (N,) that it is scored by, so it is a bound, not a method. Takes probabilities (N, K).
-    Returns thresholds (K,), above which predictions are positive, and balanced accuracies (K,), NaN without a class.
+    The threshold is chosen on the labels by which it is scored. So the result is an upper bound, not a method.
+
+    Args:
+        probabilities: the members' probabilities, float (N, K).
+        labels: whether the sub-goal holds, bool (N,).
+
+    Returns:
+        Thresholds float32 (K,), above which predictions are positive, and balanced accuracies float64 (K,). The
+        accuracies are NaN if all labels are of one class.
     """
     thresholds = np.full(probabilities.shape[1], 0.5, np.float32)
     accuracies = np.full(len(thresholds), np.nan)
@@ -69,15 +84,16 @@ def best_threshold(probabilities: Floats, labels: Bools) -> tuple[Floats, Double
 
 
 def _share_above(values: Floats, cuts: Floats) -> Doubles:
-    """The share of values that are above each cut."""
+    """Return the share of ``values`` that are above each cut."""
     not_above = np.searchsorted(np.sort(values), cuts, side="right")
     return (len(values) - not_above) / len(values)
 
 
 def halves(contexts: Ints) -> Bools | None:
-    """Split states by their contexts (layouts or rooms) (N,): whether each is in the first half, bool (N,).
+    """Split states in two by their contexts (layouts or rooms) (N,).
 
-    That is every other context by number; None with fewer than two.
+    Returns bool (N,), whether each state is in the first half, which has every other context by number. Returns None if
+    there are fewer than two contexts.
     """
     numbers = np.unique(contexts)
     if len(numbers) < 2:
@@ -86,9 +102,10 @@ def halves(contexts: Ints) -> Bools | None:
 
 
 def cross_fitted(first: Doubles, second: Doubles) -> float:
-    """The best member's score, picked on one half of the states and scored on the other, to exclude luck.
+    """Return the score of the best member, picked on one half of the states and scored on the other half.
 
-    Takes members' scores (K,) on both halves; returns the mean of both directions, NaN if one has no score.
+    The split excludes luck, because no member is scored on the states by which it was picked. Takes members' scores
+    (K,) on both halves. Returns the mean of the two directions, or NaN if no member has a score on both halves.
     """
     defined = ~np.isnan(first + second)
     if not defined.any():
@@ -98,13 +115,16 @@ def cross_fitted(first: Doubles, second: Doubles) -> float:
 
 
 def ratio(numerator: Array, denominator: Array) -> Doubles:
-    """The quotient, element by element; NaN where the denominator is 0."""
+    """Return the quotient, float64, element by element, with NaN where the denominator is 0."""
     quotient = np.full(np.shape(numerator), np.nan)
     return np.divide(numerator, denominator, out=quotient, where=denominator != 0)
 
 
 def best_mean_worst(scores: Doubles) -> dict[str, float]:
-    """Best, mean and worst of members' scores (K,) without undefined ones; NaN if none is defined."""
+    """Return the best, mean and worst of members' scores (K,), leaving out NaN.
+
+    All three are NaN if no score is defined.
+    """
     defined = scores[~np.isnan(scores)]
     if not len(defined):
         defined = np.array([math.nan])
@@ -112,30 +132,33 @@ def best_mean_worst(scores: Doubles) -> dict[str, float]:
 
 
 def most_and_least(values: Doubles) -> tuple[int | None, int | None]:
-    """The members (K,) with the highest and with the lowest value; None without any."""
+    """Return the index of the member with the highest value, and of the member with the lowest, from values (K,).
+
+    Both are None if all values are NaN.
+    """
     if np.isnan(values).all():
         return None, None
     return int(np.nanargmax(values)), int(np.nanargmin(values))
 
 
 def mean_disagreement(predictions: Bools) -> float:
-    """From predictions (N, K), the share of states on which two members differ, mean over pairs of members.
+    """Return the share of states on which two members differ, as a mean over pairs of members.
 
-    NaN for a single member or without states.
+    Takes predictions, bool (N, K). Returns NaN for a single member, or without states.
     """
     states, members = predictions.shape
     if states == 0 or members == 1:
         return math.nan
     positive = predictions.sum(1)
-    differing = positive * (members - positive)  # pairs of members, in each state
+    differing = positive * (members - positive)  # the number of pairs of members that differ, in each state
     return float(differing.mean()) / math.comb(members, 2)
 
 
 def idle_members(predictions: Bools, layouts: Ints | None = None) -> list[str]:
-    """A line for each member that is no hypothesis of its own, from predictions (M, K) on unlabelled states.
+    """Return a line for each member that is no hypothesis of its own, from predictions (M, K) on unlabelled states.
 
-    It is constant, or constant within each of several ``layouts`` (M,), or the same as an earlier member on ``SAME`` of
-    the states.
+    A member is no hypothesis of its own if it predicts one class everywhere, or one class within each of several
+    ``layouts`` (M,), or what an earlier member predicts on the share ``SAME`` of the states.
     """
     lines = []
     kinds = [] if layouts is None else [layouts == layout for layout in np.unique(layouts)]

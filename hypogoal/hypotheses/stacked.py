@@ -1,4 +1,7 @@
-"""Many member networks as one, for a few states at a time: calling each member would cost more than its arithmetic."""
+"""Many member networks as one network, for predicting a few states at a time.
+
+With few states, calling each member separately would cost more than the arithmetic of the members.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,18 +16,19 @@ from hypogoal.hypotheses.ensemble import IMAGES_AT_ONCE, Ensemble, predicting, t
 from hypogoal.hypotheses.networks import as_input, at_once, folded
 from hypogoal.observations import Observations
 
-MANY = 256  # states from which an ensemble's own prediction, which computes distinct patches once, is faster
-WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # act on all members at once
+MANY = 256  # from this number of states on, an ensemble is faster alone, because it computes distinct patches once
+WITHOUT_WEIGHTS = (nn.ReLU, nn.MaxPool2d, nn.AvgPool2d, nn.Dropout)  # layers that can act on all members at once
 
 
 class StackedMembers:
-    """All members of several ensembles with the same network, for prediction only.
+    """All members of several ensembles, joined into one network for prediction only.
 
-    The first convolution's filters are concatenated, later ones grouped; dense layers are batched products. Up to
-    rounding, the result is each ensemble's ``log_odds`` (a test asserts it). Networks with other layers, and ensembles
-    that do not see whole pictures, are not ``joined``: they predict as ensembles do, as all do of many states.
+    The G ensembles have K members each, one kind of network, one observation shape, and one device. The filters of the
+    first convolution are concatenated, later convolutions are grouped, and dense layers are batched products. Up to
+    rounding, the result is each ensemble's ``log_odds`` (a test asserts it).
 
-    The G ensembles have K members each, one network and observation shape, and one device.
+    Networks with other layers, and ensembles that do not see whole pictures, are not ``joined``: they predict as
+    ensembles do. For many states, all ensembles predict as ensembles do.
     """
 
     def __init__(self, ensembles: Sequence[Ensemble]):
@@ -41,7 +45,7 @@ class StackedMembers:
             self._layers = [(layers[0], _stack(layers)) for layers in zip(*self.networks, strict=True)]
 
     def log_odds(self, observations: Observations) -> Floats:
-        """Every member's log-odds, float32 (N, G*K), ensemble by ensemble; as :meth:`Ensemble.log_odds`."""
+        """Return every member's log-odds, float32 (N, G*K), ensemble by ensemble, as :meth:`Ensemble.log_odds` does."""
         if self.every is None:
             each = [ensemble.log_odds(observations) for ensemble in self.ensembles]
             return np.concatenate(each, axis=1)
@@ -58,9 +62,9 @@ class StackedMembers:
         return np.concatenate(rows)
 
     def _logits(self, pictures: Bytes) -> Tensor:
-        """Pictures (N, H, W, C) -> logits (members, N, 2)."""
+        """Return logits (members, N, 2) of pictures (N, H, W, C)."""
         x = as_input(tensor(pictures, self.device))
-        groups = 1  # the members share the pictures; each has channels of its own behind the first convolution
+        groups = 1  # members share the pictures, but have channels of their own behind the first convolution
         for layer, weights in self._layers:
             if isinstance(layer, nn.Conv2d):
                 bias = weights.get("bias")
@@ -76,7 +80,7 @@ class StackedMembers:
                 groups = self.count
             elif isinstance(layer, nn.Flatten):
                 x = x.reshape(len(x), groups, -1).transpose(0, 1)
-                x = x.expand(self.count, -1, -1)  # without a convolution, they share the pictures until here
+                x = x.expand(self.count, -1, -1)  # without a convolution, members share the pictures until here
             elif isinstance(layer, nn.Linear):
                 x = torch.baddbmm(weights["bias"], x, weights["weight"])
             else:
@@ -85,7 +89,10 @@ class StackedMembers:
 
 
 def _can_be_joined(network: nn.Sequential) -> bool:
-    """Whether it is convolutions, one Flatten and dense layers, with what has no weights between them."""
+    """Say whether a network can be joined with others.
+
+    Such a network has convolutions, one Flatten and dense layers, with only layers without weights between them.
+    """
     flat = False
     layer: Any
     for layer in network:
@@ -105,13 +112,13 @@ def _can_be_joined(network: nn.Sequential) -> bool:
 
 
 def _stack(layers: Sequence[nn.Module]) -> dict[str, Tensor]:
-    """The weights of one layer of every member, joined as :meth:`StackedMembers._logits` needs them."""
+    """Return the weights of one layer of all members, joined as :meth:`StackedMembers._logits` needs them."""
     weights = {}
     for name in layers[0].state_dict():
         each = [layer.state_dict()[name] for layer in layers]
         if isinstance(layers[0], nn.Conv2d):
             weights[name] = torch.cat(each)
-            if name == "weight":  # in the memory order of pictures; else each call would copy it
+            if name == "weight":  # in the memory order of pictures, because otherwise each call would copy the weights
                 weights[name] = weights[name].contiguous(memory_format=torch.channels_last)
         elif name == "weight":
             weights[name] = torch.stack([weight.T for weight in each]).contiguous()

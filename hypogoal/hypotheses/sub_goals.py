@@ -1,4 +1,4 @@
-"""The ensemble of one sub-goal: checked, trained with a log, written, and judged for a first time."""
+"""The ensemble of one sub-goal: its settings are checked, and it is trained with a log, written and first judged."""
 
 import contextlib
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 from hypogoal.observations import spread_rows
 
-LOOKED_AT = 1_000  # held-out or unlabelled states, cheap beside training
+LOOKED_AT = 1_000  # the number of held-out or unlabelled states that are judged, which is cheap beside training
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What came of one sub-goal's training.
+    """The result of one sub-goal's training.
 
     Attributes:
-        accuracies: see :func:`heldout_accuracy`.
+        accuracies: balanced accuracies by name, see :func:`heldout_accuracy`.
         chosen: what was chosen where settings are ``auto``, and the members that are ``idle``
             (:func:`scores.idle_members`).
     """
@@ -38,7 +38,7 @@ class Trained:
 
 
 def check_names(config: TrainEnsembleConfig) -> None:
-    """Load what settings name, before there is any data; a name that is none of them is a ``UserError``."""
+    """Load everything that settings name, before there is any data. Raises ``UserError`` if a name is unknown."""
     load_objective(config.diversity)
     thresholds.threshold_rule(config.threshold)
     if config.teacher:
@@ -51,7 +51,10 @@ def check_names(config: TrainEnsembleConfig) -> None:
 
 
 def checked(config: TrainEnsembleConfig, dataset: Dataset) -> tuple[TrainEnsembleConfig, Sequence[str]]:
-    """The settings with the network that fits the data, and the sub-goals; what cannot be trained is refused."""
+    """Return the settings with the network that fits the data, and the sub-goals to train.
+
+    Raises ``UserError`` if something cannot be trained.
+    """
     check_names(config)
     dtype = dataset.observation_dtype
     view = views.view_of(config.view, config.view_settings, dataset.observation_shape, dtype)
@@ -83,9 +86,10 @@ def train_sub_goal(
     tensorboard: Path | None,
     quiet: bool,
 ) -> Trained:
-    """Train a sub-goal's ensemble, in a process of its own, and write it.
+    """Train the ensemble of one sub-goal, write it, and return what came of it.
 
-    ``others`` are the files of unlabelled states, if not ``data``. The log has the steps of the last training.
+    This function runs in a process of its own. ``others`` are the files of unlabelled states. If ``others`` is empty,
+    the unlabelled states of ``data`` are used. The log has the steps of the last training only.
     """
     prepare()
     dataset = open_dataset(data)
@@ -124,16 +128,19 @@ def train_sub_goal(
 
 
 def log_of(draft: Draft, sub_goal: str) -> Path:
-    """The log of one sub-goal's training, beside its checkpoint."""
+    """Return the path of the log of one sub-goal's training, which lies beside its checkpoint."""
     return draft.checkpoint / f"{sub_goal}.jsonl"
 
 
 def heldout_accuracy(ensemble: Ensemble, dataset: Dataset, sub_goal: str) -> dict[str, float]:
-    """Best, mean and worst member's balanced accuracy on some held-out states; NaN without states of both classes."""
+    """Return the best, mean and worst member's balanced accuracy on some held-out states.
+
+    All three are NaN if there are no held-out states of both classes.
+    """
     try:
         states = dataset.heldout(sub_goal)
         states = states.where(spread_rows(len(states.labels), LOOKED_AT))
         predictions = ensemble.predictions(states.observations)
-    except UserError:  # training needs none of them: what is wrong is said by ``evaluate``
+    except UserError:  # training needs no held-out states, and ``evaluate`` says what is wrong with them
         return scores.best_mean_worst(np.full(len(ensemble), np.nan))
     return scores.best_mean_worst(scores.member_scores(predictions, states.labels)["balanced_accuracy"])

@@ -1,4 +1,4 @@
-"""A teacher: own code that says what members should predict in unlabelled states, beside the labels."""
+"""Teachers: the user's own code that says what members should predict in unlabelled states, beside the labels."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,10 @@ from hypogoal.observations import digest
 
 
 def load_teacher(name: str) -> Callable[..., Any]:
-    """The function ``module:function``, or of an entry point; any other name is a ``UserError``."""
+    """Return the function that ``name`` names: ``module:function``, or an installed entry point.
+
+    Raises ``UserError`` if ``name`` is anything else.
+    """
     teacher = load(name, "teacher", "hypogoal.teachers", {})
     if not callable(teacher):
         raise UserError("this is no teacher", name, "Give a function, see docs/extending.md.")
@@ -28,9 +31,11 @@ def taught_by(
     members: int,
     seed: int,
 ) -> Tensor:
-    """A teacher's scores of unlabelled states, float32 (K, M); others than finite ones are a ``UserError``.
+    """Return a teacher's scores of unlabelled states, float32 (K, M), clipped to -1..1.
 
-    It gets labelled observations (N, *obs), labels bool (N,), unlabelled observations (M, *obs), K and a seed.
+    The teacher is called with the labelled observations (N, *obs), their labels bool (N,), the unlabelled observations
+    (M, *obs), K and a seed. Raises ``UserError`` if the teacher gives anything but finite scores (K, M), or if it
+    changes what it gets.
     """
     teacher = load_teacher(name)
     shape = (members, len(unlabelled))

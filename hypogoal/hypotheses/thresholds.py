@@ -12,14 +12,14 @@ from hypogoal.core.own_code import load
 PAPER = "0.5"
 SPLIT = "unlabelled-split"
 RULES = {SPLIT: f"{__name__}:unlabelled_split"}
-ENTRY_POINTS = "hypogoal.thresholds"  # with which other packages add rules
-CERTAIN = 1e-12  # probabilities are clipped this far from 0 and 1
+ENTRY_POINTS = "hypogoal.thresholds"  # the entry point group by which other packages add rules
+CERTAIN = 1e-12  # probabilities are clipped to stay at least this far from 0 and 1
 BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))
 Probabilities = Floats  # (states, K)
 
 
 def log_odds_of(probabilities: Array) -> Doubles:
-    """The log-odds of probabilities (...,), always finite."""
+    """Return the log-odds of probabilities (...,), float64, always finite."""
     exact = probabilities.astype(float).clip(CERTAIN, 1 - CERTAIN)
     return np.log(exact) - np.log1p(-exact)
 
@@ -29,12 +29,15 @@ def unlabelled_split(
     labels: Bools,
     unlabelled: Probabilities,
 ) -> Any:
-    """Where each member's log-odds of the unlabelled states fall into two classes best, (K,)."""
+    """Return the thresholds (K,) at which each member's log-odds of unlabelled states fall into two classes best."""
     return np.array([_cut(log_odds_of(np.sort(of_member))) for of_member in unlabelled.T])
 
 
 def _cut(logits: Doubles) -> float:
-    """Otsu (1979): the cut of rising log-odds into two classes with the least variance within, as a probability."""
+    """Return the probability that best cuts rising log-odds into two classes (Otsu 1979).
+
+    The best cut has the least variance within the classes.
+    """
     if len(logits) < 2:
         return 0.5
     below = np.arange(1, len(logits))
@@ -46,7 +49,11 @@ def _cut(logits: Doubles) -> float:
 
 
 def threshold_rule(name: str) -> Callable[[Probabilities, Bools, Probabilities], Any]:
-    """The rule of a setting; what is no number between 0 and 1, no rule and no function is a ``UserError``."""
+    """Return the function that a setting names.
+
+    A number between 0 and 1 gives a rule that sets this number for all members. Raises ``UserError`` if ``name`` is
+    neither such a number nor a rule nor a function.
+    """
     try:
         number = float(name)
     except ValueError:
@@ -62,17 +69,20 @@ def thresholds(
     labels: Bools,
     unlabelled: Probabilities,
 ) -> Floats:
-    """The thresholds float32 (K,) that a rule sets.
+    """Return the thresholds, float32 (K,), that a rule sets.
 
-    A threshold stays below 1, so a member that is certain of more states than the rule allows still predicts them
-    positive. The prediction for the state whose probability is the threshold depends on rounding, see
+    A threshold stays below 1. So a member that is certain of more states than the rule allows still predicts those
+    states positive. If the probability of a state equals the threshold, the prediction depends on rounding, see
     :meth:`Ensemble.predictions`.
 
     Args:
-        name: a number, ``unlabelled-split``, or ``module:function`` of the other arguments.
-        labelled: float32 (N, K), the members' probabilities of the labelled states.
-        labels: bool (N,), which of them are positive.
-        unlabelled: float32 (M, K), the members' probabilities of the unlabelled states.
+        name: a number, ``unlabelled-split``, or a ``module:function`` that takes the other arguments.
+        labelled: float32 (N, K), the members' probabilities for the labelled states.
+        labels: bool (N,), whether each labelled state is positive.
+        unlabelled: float32 (M, K), the members' probabilities for the unlabelled states.
+
+    Raises:
+        UserError: if the rule is unknown, or does not give K probabilities.
     """
     rule, members = threshold_rule(name), labelled.shape[1]
     chosen = np.asarray(rule(labelled, labels, unlabelled))

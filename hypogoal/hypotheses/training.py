@@ -1,6 +1,6 @@
-"""The training of one sub-goal's ensemble: from states to trained members with thresholds, resumable.
+"""The training of one sub-goal's ensemble: from states to trained members with thresholds. It can be resumed.
 
-:mod:`hypogoal.hypotheses.fit` has the loop and its words.
+:mod:`hypogoal.hypotheses.fit` has the loop over batches, and defines its words.
 """
 
 from collections.abc import Iterator
@@ -25,38 +25,39 @@ from hypogoal.hypotheses.fit import Losses, fit, objective_of
 from hypogoal.hypotheses.teacher import taught_by
 from hypogoal.observations import Observations
 
-CHECKED_EVERY = 10  # steps between checks for NaN, and between lines of a log
+CHECKED_EVERY = 10  # the number of steps between checks for NaN, and between lines of a log
 
 
 def require_unlabelled(unlabelled: Observations) -> None:
-    """Refuse (``UserError``) to make members differ where there are no unlabelled states."""
+    """Raise ``UserError`` if there are no unlabelled states, without which members cannot be made to differ."""
     if not len(unlabelled):
         do = "Give some, or set diversity=none, threshold=0.5 and no teacher."
         raise UserError("unlabelled states are needed to make members differ", None, do)
 
 
 class EnsembleTraining(Resumable):
-    """One sub-goal's members in training: all at once, or one after the other (``schedule=sequential``).
+    """The training of one sub-goal's members: all at once, or one after the other (``schedule=sequential``).
 
-    On one CPU in one thread the same arguments give the same bytes. Where a network of the user's own draws from
-    PyTorch's global generator, so does :meth:`steps`, which gives it back as it was.
+    On one CPU in one thread, equal arguments give equal bytes. If a user's network draws from PyTorch's global
+    generator, :meth:`steps` draws from it, too, and then restores the generator's state.
 
     Args:
         observations: the labelled states (N, *obs).
-        labels: whether the sub-goal holds there (N,).
-        unlabelled: (M, *obs); may be empty if nothing makes members differ.
+        labels: whether the sub-goal holds in the labelled states, bool (N,).
+        unlabelled: the unlabelled states (M, *obs). M may be 0 if nothing makes members differ.
         config: the settings.
-        seed: of weights, batches, and whatever else is random.
+        seed: the seed of weights, of batches, and of whatever else is random.
         origins: the states' origins, for a view that needs them.
-        device: where to train; the ensemble stays there.
-        first: the weights of the first member of a sequential ensemble, which is trained already.
-        saved: a ``snapshot`` of the same training, to go on from.
+        device: the device on which the ensemble is trained, and stays.
+        first: the weights of the first member of a sequential ensemble, if that member is trained already.
+        saved: a ``snapshot`` of the same training, from which to go on.
 
     Attributes:
-        ensemble: the members, at any time to predict with; once all steps are done, in evaluation mode.
+        ensemble: the members, which can predict at any time. Once all steps are done, they are in evaluation mode.
 
     Raises:
-        UserError: labels of one class only, or no unlabelled states although members or thresholds need them.
+        UserError: if all labels are of one class, or if there are no unlabelled states although members or thresholds
+            need them.
     """
 
     CHANGING = ("number", "done", "ensemble", "optimiser", "states", "taught")
@@ -85,12 +86,12 @@ class EnsembleTraining(Resumable):
             views.learn_from(view, observations, unlabelled, origins, seed)
         weights = seeding.torch_generator(seed, "weights")
         self.ensemble = Ensemble(config.network, shape, config.members, weights, view).to(device)
-        stored(self.ensemble.state_dict(), "the network")  # what cannot be is not worth training
+        stored(self.ensemble.state_dict(), "the network")  # a network that cannot be stored is not worth training
         if first:
             self.ensemble.networks[0].load_state_dict(first)
         self.taught = None
         if saved:
-            self.ensemble.load_state_dict(saved["ensemble"])  # with what the view has learned
+            self.ensemble.load_state_dict(saved["ensemble"])  # includes what the view has learned
         elif config.teacher:
             drawn = seeding.seed_for(seed, "proposals")
             self.taught = taught_by(config.teacher, observations, labels, unlabelled, config.members, drawn)
@@ -104,17 +105,17 @@ class EnsembleTraining(Resumable):
             self._layers = saved["layers"]
 
     def snapshot(self) -> State:
-        """All that the next steps depend on."""
+        """Return all that the next steps depend on."""
         return super().snapshot() | {"layers": torch.get_rng_state()}
 
     def steps(self) -> Iterator[tuple[int, Losses]]:
-        """Take the steps that are left, then set thresholds; yields each step's number and losses.
+        """Take the steps that are left, then set thresholds. Yield the number and the losses of each step.
 
-        ``NumericalError``: a loss is NaN or Inf; the message names the member and the step.
+        Raises ``NumericalError`` if a loss is NaN or Inf. The message names the member and the step.
         """
         device = self.states.device
         devices = [device] if device.type == "cuda" else []
-        with torch.random.fork_rng(devices=devices):  # Dropout and similar layers draw there
+        with torch.random.fork_rng(devices=devices):  # Dropout and similar layers draw from the global generator
             yield from self._round()
             while self.number + 1 < len(self.rounds):
                 self._begin(self.number + 1)
@@ -127,7 +128,7 @@ class EnsembleTraining(Resumable):
             self.ensemble.thresholds.copy_(torch.from_numpy(chosen))
 
     def predict(self, observations: Observations) -> Floats:
-        """The probabilities (N, k) of the k members that are trained, or being trained, see :class:`Ensemble`."""
+        """Return the probabilities (N, k) of the k members that are trained or in training, see :class:`Ensemble`."""
         *_, last = self.rounds[self.number]
         return self.ensemble.predict(observations)[:, : last + 1]
 
@@ -141,7 +142,7 @@ class EnsembleTraining(Resumable):
         self.optimiser = Adam(weights, self.config.learning_rate, weight_decay=self.config.l2_weight)
 
     def _round(self) -> Iterator[tuple[int, Losses]]:
-        """Train the members of the round that has begun."""
+        """Train the members of the round that has begun, and yield the number and the losses of each step."""
         config, members, device = self.config, self.rounds[self.number], self.states.device
         torch.manual_seed(seeding.seed_for(self._round_seed, "layers"))
         if self._layers is not None:
@@ -161,12 +162,12 @@ class EnsembleTraining(Resumable):
 
     @property
     def due(self) -> bool:
-        """Whether losses are due to be checked and logged: every some steps, since each makes a GPU wait."""
+        """Whether losses are due to be checked and logged: only every few steps, since each check makes a GPU wait."""
         return self.done % CHECKED_EVERY == 0 or self.done == self.config.steps
 
     @property
     def step(self) -> int:
-        """How many steps are done, of all rounds."""
+        """The number of steps done, over all rounds."""
         return self.number * self.config.steps + self.done
 
     def _require_finite(self, last: list[Losses]) -> None:
@@ -179,7 +180,7 @@ class EnsembleTraining(Resumable):
 
 
 def train(*arguments: Any, **more: Any) -> Ensemble:
-    """The ensemble of a :class:`EnsembleTraining` with these arguments."""
+    """Train an ensemble to the end, and return it. The arguments are those of :class:`EnsembleTraining`."""
     training = EnsembleTraining(*arguments, **more)
     for _ in training.steps():
         pass

@@ -1,4 +1,4 @@
-"""What members see of an observation: all of it, or what a view of one's own shows (beyond the paper)."""
+"""What members see of an observation: all of it, or what a view of the user's own shows (beyond the paper)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,29 +27,30 @@ from hypogoal.observations import (
     standardised,
 )
 
-ENTRY_POINTS = "hypogoal.views"  # with which other packages add views
+ENTRY_POINTS = "hypogoal.views"  # the entry point group by which other packages add views
 Origins = Mapping[str, Ints]
 
 
 @dataclass(frozen=True)
 class StateOrigins:
-    """Where training states come from, as far as it is known: int64 (N,) by name."""
+    """Where training states come from, as far as that is known: int64 (N,) by the origin's name."""
 
     labelled: Origins = field(default_factory=dict)
     unlabelled: Origins = field(default_factory=dict)
 
 
 class View(nn.Module):
-    """What members see of observations: all of them; ``view=module:Class`` names a subclass of one's own.
+    """What members see of observations: by default all of them.
 
-    ``__init__`` gets the observations' shape and a ``Settings``. Parameters and buffers are saved and loaded with the
-    ensemble, so it makes them in their final shapes.
+    ``view=module:Class`` names a subclass of the user's own. Its ``__init__`` gets the observations' shape and a
+    ``Settings``. Parameters and buffers are saved and loaded with the ensemble, so ``__init__`` must make them in their
+    final shapes.
 
     Attributes:
         Settings: a ``Config`` of :func:`hypogoal.core.config.setting` fields, which ``--set view.KEY=VALUE`` changes.
-        changes: whether batches are changed at random.
-        dtype: of observations, and of what members see.
-        shape: of what members see of one.
+        changes: whether the view changes batches at random.
+        dtype: the type of observations, and of what members see.
+        shape: the shape of what members see of one observation.
     """
 
     Settings: type[Config] = Config
@@ -59,39 +60,42 @@ class View(nn.Module):
 
     @property
     def standard(self) -> Standard | None:
-        """Mean and deviation of numbers, where they are standardised."""
+        """The mean and deviation by which numbers are standardised, or None if they are not."""
         return None
 
     def fit(self, labelled: Any, unlabelled: Any, origins: StateOrigins, seed: int) -> None:
-        """Learn from the training states (N, ...) and (M, ...); by default nothing."""
+        """Learn from the training states, labelled (N, ...) and unlabelled (M, ...). By default nothing is learned."""
 
     def see(self, observations: Any) -> Any:
-        """What members see, (N, *shape), of observations (N, ...)."""
+        """Return what members see, (N, *shape), of observations (N, ...)."""
         return observations
 
     def to_change(self, observations: Any) -> Any:
-        """What training keeps of observations for :meth:`change`; by default what members see."""
+        """Return what training keeps of observations for :meth:`change`. By default this is what members see."""
         return self.see(observations)
 
     def change(self, batch: Any, rng: np.random.Generator | None) -> Any:
-        """What members see of a batch of :meth:`to_change`: changed at random, or without ``rng`` as it is.
+        """Return what members see of a batch that :meth:`to_change` gave.
 
-        Pictures (B, *shape) are uint8, or float32 in 0..1.
+        The batch is changed at random, or left as it is if ``rng`` is None. Pictures (B, *shape) are uint8, or float32
+        in 0..1.
         """
         return batch
 
     def pools(self, labels: Bools, origins: Origins) -> tuple[list[Ints], float]:
-        """The positives in pools that take turns, by number, and their share of labelled batches.
+        """Return the pools from which positives are drawn, and the share of positives in a labelled batch.
 
-        By default all in one, and half, so that the class weights apply (DEV-13).
+        A pool has the indices of positive labelled states, int64 (n,). Positives are drawn from the pools in turn. By
+        default there is one pool with all positives and their share is half, so that the class weights apply (DEV-13).
         """
         return [np.flatnonzero(labels)], 0.5
 
 
 class FullView(View):
-    """All of an observation: a picture as it is, the paper's view; numbers standardised by what it learned of them.
+    """The view that shows all of an observation: pictures as they are, as in the paper, and numbers standardised.
 
-    ``standard`` (*shape) is what it has learned already. Of a mixed observation it is that of all its numbers, (D,).
+    ``standard`` (*shape) is the mean and deviation of numbers, if they are known already. For mixed observations, they
+    are the mean and deviation of all numbers together, (D,).
     """
 
     mean: Tensor
@@ -111,7 +115,7 @@ class FullView(View):
 
     @property
     def standard(self) -> Standard | None:
-        """Mean and deviation (*shape) of numbers; None for pictures."""
+        """The mean and deviation (*shape) of numbers, or None for pictures."""
         if not self.standardises:
             return None
         return self.mean.cpu().numpy(), self.deviation.cpu().numpy()
@@ -126,7 +130,7 @@ class FullView(View):
         self.deviation.copy_(torch.from_numpy(deviation))
 
     def see(self, observations: Observations) -> Observations:
-        """The observations (N, *shape)."""
+        """Return the observations (N, *shape), with numbers standardised."""
         if self.standard is None:
             return observations
         if not self.dtype.names:
@@ -143,14 +147,19 @@ class FullView(View):
 
 
 def load_view(name: str) -> type[View]:
-    """The view ``module:Class``; no such one, and code that the user did not allow, are a ``UserError``."""
+    """Return the view class ``module:Class``.
+
+    Raises ``UserError`` if there is no such class, or if the user did not allow the code.
+    """
     return load_class(name, "view", View, {}, ENTRY_POINTS)
 
 
 def view_of(name: str, settings: Sequence[str], observation_shape: Shape, dtype: DType) -> View:
-    """The view ``full``, or ``module:Class`` with its settings, ``KEY=VALUE``, of such observations; it learns later.
+    """Return the view named ``full`` or ``module:Class``, before it has learned.
 
-    No such view or setting, and code that the user did not allow, are a ``UserError``.
+    ``settings`` of the user's own view are texts ``KEY=VALUE``. The view is made for observations of the given shape
+    and type. Raises ``UserError`` if there is no such view or setting, if the view is of another type of observations,
+    or if the user did not allow the code.
     """
     if name == FULL:
         return FullView(observation_shape, dtype)
@@ -163,7 +172,10 @@ def view_of(name: str, settings: Sequence[str], observation_shape: Shape, dtype:
 
 
 def learn_from(view: View, labelled: Any, unlabelled: Any, origins: StateOrigins, seed: int) -> None:
-    """:meth:`View.fit`; a view that then shows other than it says, or changes what it gets, is a ``UserError``."""
+    """Call :meth:`View.fit`, then check what the view shows.
+
+    Raises ``UserError`` if the view shows another shape or type than it declares, or if it changes its input.
+    """
     view.fit(labelled, unlabelled, origins, seed)
     name = type(view).__name__
     two = labelled[:2].copy()
@@ -178,7 +190,10 @@ def learn_from(view: View, labelled: Any, unlabelled: Any, origins: StateOrigins
 
 
 def changed_by(view: View, batch: Any, rng: np.random.Generator | None) -> Any:
-    """:meth:`View.change`; anything but (B, *shape) of the view's type, or pictures in 0..1, is a ``UserError``."""
+    """Call :meth:`View.change` and check the result.
+
+    Raises ``UserError`` if the result is anything but (B, *shape) of the view's type, or pictures in 0..1.
+    """
     changed = np.asarray(view.change(batch, rng))
     wanted = (len(batch), *view.shape)
     most = np.inf if changed.dtype == view.dtype else 1
@@ -193,7 +208,10 @@ def changed_by(view: View, batch: Any, rng: np.random.Generator | None) -> Any:
 
 
 def pools_of(view: View, labels: Bools, origins: Origins) -> tuple[list[Ints], float]:
-    """:meth:`View.pools`; pools that are empty or not of positives, or another share, are a ``UserError``."""
+    """Call :meth:`View.pools` and check the result.
+
+    Raises ``UserError`` if a pool is empty or has others than positives, or if the share is not between 0 and 1.
+    """
     pools, share = view.pools(labels, origins)
     numbers = np.zeros(0)
     if pools and all(map(len, pools)):
