@@ -12,12 +12,12 @@ RATIO_WEIGHT = 1.0  # the weight of the ratio term beside the mutual information
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """Return the mutual information of all ordered pairs, plus each member's deviation from an expected share of
-    positives.
+    """Return the mutual information of all ordered pairs, plus a ratio term.
 
-    The loss is ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``. p(y) comes from the setting
-    ``share``, which in the source is the labelled states' share of positives. The second term keeps members from
-    predicting one class for all unlabelled states, because there the first term is 0 without a gradient.
+    The loss is ``sum_m sum_{i != m} I(y_i; y_m) + w sum_m KL(mean_n p_m(y|n) || p(y))``. The second term, the ratio
+    term, is each member's deviation from an expected share of positives. p(y) comes from the setting ``share``, which
+    in the source is the labelled states' share of positives. The ratio term keeps members from predicting one class for
+    all unlabelled states, because there the first term is 0 without a gradient.
 
     Returns:
         float (), in nats, at least 0 up to rounding. The loss is 0 if there are no states.

@@ -10,14 +10,13 @@ MOST = 0.5  # the largest share of unlabelled states on which a member may be po
 
 
 def ensemble_loss(context: Context) -> Tensor:
-    """Return the mutual information of all ordered pairs, plus each member's deviation from a range of shares of
-    positives.
+    """Return the mutual information of all ordered pairs, plus deviations from a range of shares of positives.
 
     The loss is ``sum_m sum_{i != m} I(y_i; y_m) + sum_m KL(s_m || nearest of [share, 1/2])``, with s_m = mean_n
-    p_m(y|n). DivDis expects the same share of positives of every member. But two features that the labels fit need not
-    hold equally often, and a member that must be positive on more or fewer states than its feature is a mixture. So in
-    this objective the setting ``share`` is the smallest share of the range: a state that fits all features at once is
-    rarer than a state that fits any one feature.
+    p_m(y|n). The second term is each member's deviation from the range. DivDis expects the same share of positives of
+    every member. But two features that the labels fit need not hold equally often, and a member that must be positive
+    on more or fewer states than its feature is a mixture. So in this objective the setting ``share`` is the smallest
+    share of the range: a state that fits all features at once is rarer than a state that fits any one feature.
 
     Returns:
         float (), in nats, at least 0 up to rounding. The loss is 0 if there are no states.

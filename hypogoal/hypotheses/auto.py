@@ -214,8 +214,9 @@ class AutoTraining:
         return self.now.ensemble
 
     def cost(self, folds: int, weights: int) -> int:
-        """Return the number of steps of all trainings if ``weights`` weights are tried in ``folds`` folds, each to its
-        end.
+        """Return the number of steps of all trainings.
+
+        ``weights`` weights are tried in each of ``folds`` folds, each to the end of its training.
         """
         config = self.config
         first = config.steps + (config.restarts - 1) * self.early if self.begins_alone else 0

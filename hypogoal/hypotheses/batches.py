@@ -190,13 +190,12 @@ def plain_forward(
     sizes: Sequence[int],
     counted: bool,
 ) -> Tensor:
-    """Return a network's outputs for labelled inputs followed by unlabelled inputs; ``sizes`` are the two numbers of
-    inputs.
+    """Return a network's outputs for labelled inputs followed by unlabelled inputs.
 
-    In training, BatchNorm standardises each of the two groups by the mean and variance of that group alone. The running
-    mean and variance, by which a trained network predicts, follow both groups, the labelled group first. If the
-    unlabelled group is not ``counted``, the running mean and variance follow the labelled group alone. All other layers
-    take both groups at once.
+    ``sizes`` are the number of labelled inputs and the number of unlabelled inputs. In training, BatchNorm standardises
+    each of the two groups by the mean and variance of that group alone. The running mean and variance, by which a
+    trained network predicts, follow both groups, the labelled group first. If the unlabelled group is not ``counted``,
+    the running mean and variance follow the labelled group alone. All other layers take both groups at once.
     """
     values = inputs
     for layer in network:

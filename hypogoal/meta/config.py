@@ -1,6 +1,6 @@
-"""Settings of agents: where options are played, how the meta-policy learns.
+"""Settings of agents: where options are played, and how the meta-policy learns.
 
-The light recipe's are the defaults, those of Table 5 are in the ``paper`` preset.
+The light recipe's values are the defaults. The values of Table 5 are in the ``paper`` preset.
 """
 
 from typing import ClassVar
@@ -10,7 +10,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.world import WorldConfig
 from hypogoal.options.config import OptionConfig
 
-GAMMA = 0.99  # discount per environment step, ours: an option of tau steps counts GAMMA^tau; the paper gives none
+GAMMA = 0.99  # discount per environment step, so GAMMA^tau for an option of tau steps. Ours: the paper gives none.
 
 
 class MetaConfig(Config):
@@ -18,68 +18,83 @@ class MetaConfig(Config):
 
     meta_network: str = setting(
         "light",
-        "light, a small network on cells; the paper's three convolutions; or the light one with an own embedding",
+        "network of the meta-policy: light, a small network on cells; paper, three convolutions; or module:object, the "
+        "light network with your own embedding",
         source="paper: three convolutions; the others: ours",
         choices=("light", "paper"),
         own=True,
     )
     head: str = setting(
-        "categorical", "distribution over options", source="gaussian: paper", choices=("categorical", "gaussian")
+        "categorical",
+        "distribution from which the meta-policy draws an option",
+        source="gaussian: paper",
+        choices=("categorical", "gaussian"),
     )
     gae_lambda: float = setting(
-        0.95, "lambda of the advantage estimate, per decision", source="paper: 0.97", low=0.0, high=1.0
+        0.95, "lambda of generalised advantage estimation, per decision", source="paper: 0.97", low=0.0, high=1.0
     )
-    decisions: int = setting(512, "decisions between two updates", source="Table 5: 100", low=2)
-    epochs: int = setting(6, "passes over the decisions per update", source="Table 5: 10", low=1)
-    meta_batch: int = setting(128, "decisions per gradient step", source="Table 5: 64", low=1)
+    decisions: int = setting(
+        512, "decisions between two updates; a decision is the choice of one option", source="Table 5: 100", low=2
+    )
+    epochs: int = setting(6, "passes over the decisions in each update", source="Table 5: 10", low=1)
+    meta_batch: int = setting(128, "decisions in each gradient step", source="Table 5: 64", low=1)
     meta_learning_rate: float = setting(5e-4, "Adam's step size", source="authors' code: 2.5e-4", low=0.0)
     advantage_floor: float = setting(
         0.1,
-        "advantages are divided by their standard deviation, or by this if it is larger",
+        "advantages are divided by their standard deviation, or by this number if it is larger",
         source="ours (DEV-34); paper: 0",
         low=0.0,
     )
 
 
 class SymbolsConfig(Config):
-    """A counted table of symbols: chooser=symbols."""
+    """A table that counts what options lead to: chooser=symbols."""
 
     history: int = setting(
-        0, "how many of an episode's last options belong to its symbols, beside those offered", low=0, high=2
+        0,
+        "number of an episode's last options that belong to the symbols, beside the options offered",
+        low=0,
+        high=2,
     )
     carried: str = setting(
         "prior",
-        "what is taken over of the counts of 'agent': nothing, at most one execution of each, or all",
+        "how many counts are taken over from the agent that --agent names: none; prior, at most one execution of each "
+        "option in each symbols; or all",
         choices=("none", "prior", "all"),
     )
 
 
 class OwnChooserConfig(MetaConfig, SymbolsConfig):
-    """The settings of all choosers, for one of your own."""
+    """The settings of all choosers, for a chooser of your own."""
 
 
 class PlayConfig(OptionConfig, WorldConfig):
     """Where options are played."""
 
-    gamma: ClassVar[float] = 1.0  # discount per environment step of what options return
+    gamma: ClassVar[float] = 1.0  # discount per environment step of the rewards inside an option
 
-    steps: int = setting(1, "environment steps", unit="steps", low=1)
-    chooser: str = setting("random", "who chooses options", own=True)
+    steps: int = setting(1, "environment steps, all environments together", unit="steps", low=1)
+    chooser: str = setting("random", "the chooser, which decides what option runs next", own=True)
     layouts: str = setting(
         "",
-        "layouts to draw episodes from: 1000, so many from 'layout_seed' on, or seeds, 1000-1999; empty: that one",
+        "layouts from which episodes are drawn: a number, such as 1000, for the layouts with the 1000 seeds from "
+        "'layout_seed' on; or seeds, such as 1000-1999; empty: the layout 'layout_seed' alone",
         source="ours: the paper lives on one",
     )
     save_visited: int = setting(
         0,
-        "distinct visited states to save as a data file, for training ensembles",
+        "number of distinct visited states to save as a data file, on which ensembles can be trained",
         source="the paper's suggestion",
         low=0,
     )
 
 
 def layout_seeds(layouts: str, first: int | None = None) -> list[int]:
-    """The seeds that ``layouts`` names, each once, a bare number so many from ``first`` on; else a ``UserError``."""
+    """Return the distinct seeds that ``layouts`` names.
+
+    A bare number n means the n seeds from ``first`` on. An empty text means ``first`` alone. Raises ``UserError`` if
+    ``layouts`` cannot be read, or if ``first`` is needed and None.
+    """
     text = layouts.strip()
     if text and not text.isdecimal():
         return list(dict.fromkeys(integers(text)))
@@ -96,14 +111,15 @@ class PracticeConfig(PlayConfig):
 
     steps: int = setting(
         60_000,
-        "environment steps, all environments together; of each option, where options are restarted",
+        "environment steps, all environments together; if options are restarted, environment steps for each option",
         unit="steps",
         source="paper: 3e5 for each option",
         low=1,
     )
     chooser: str = setting(
         "random",
-        "random: uniform among the options offered; even: the one with the fewest steps so far",
+        "the chooser, which decides what option runs next: random, uniform among the options offered; even, the option "
+        "with the fewest steps so far",
         source="paper, policy learning",
         choices=("random", "even"),
         own=True,
@@ -115,7 +131,8 @@ class TrainOptionsConfig(PracticeConfig):
 
     until: float = setting(
         0.0,
-        "training ends once this share of the last 100 episodes has succeeded, at 'steps' at the latest; 0: only then",
+        "training ends once this share of the last 100 episodes has succeeded, and after 'steps' at the latest; "
+        "0: only after 'steps'",
         source="ours: practice for a task in which choosing decides",
         low=0.0,
         high=1.0,
@@ -132,7 +149,8 @@ class TrainMetaConfig(PlayConfig):
     )
     chooser: str = setting(
         "symbols",
-        "who chooses options: symbols, a counted table; ppo, a network; random, uniform",
+        "the chooser, which decides what option runs next: symbols, a table that counts; ppo, a network; random, "
+        "uniform among the options offered",
         source="ours (DEV-54); paper: ppo",
         choices=("symbols", "ppo", "random"),
         own=True,
@@ -145,17 +163,34 @@ class TrainMetaConfig(PlayConfig):
 class AuditConfig(PracticeConfig):
     """How policies learn to fool a classifier, and what is tried against them."""
 
-    option_timeout: int = setting(50, "an execution ends after this many steps", unit="steps", low=1, high=32_000)
+    option_timeout: int = setting(
+        50,
+        "an execution, which is one run of a policy, ends after this many steps at the latest",
+        unit="steps",
+        low=1,
+        high=32_000,
+    )
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
-    mask_reached: bool = setting(False, "do not begin executions where the prediction is already positive")
+    mask_reached: bool = setting(
+        False, "do not begin runs of a policy where its classifier's prediction is already positive"
+    )
     steps: int = setting(80_000, "environment steps, all policies together", unit="steps", low=1)
     chooser: str = setting(
-        "even", "who plays: the policy with the fewest steps so far, or any", choices=("random", "even"), own=True
+        "even",
+        "which policy plays next: even, the policy with the fewest steps so far; random, any policy",
+        choices=("random", "even"),
+        own=True,
     )
     threshold: float = setting(
         0.0,
-        "a prediction is positive above this probability; 0: a member's own threshold, or 0.5 for other classifiers",
+        "a prediction is positive above this probability; 0: above a member's own threshold, or above 0.5 for other "
+        "classifiers",
         low=0.0,
         high=1.0,
     )
-    mend: float = setting(0.95, "a second policy learns against this higher threshold; 0: none", low=0.0, high=1.0)
+    mend: float = setting(
+        0.95,
+        "a second policy learns to fool the classifier at this higher threshold; 0: no second policy",
+        low=0.0,
+        high=1.0,
+    )

@@ -14,22 +14,22 @@ def smdp_advantages(
     ended: Bools,
     trace: float,
 ) -> Doubles:
-    """Generalised advantages of consecutive decisions of one environment.
+    """Return the generalised advantages of consecutive decisions of one environment.
 
     delta_t = R_t + gamma^tau_t (1 - terminated_t) V(s'_t) - V(s_t);
     A_t = delta_t + gamma^tau_t lambda (1 - ended_t) A_{t+1}.
 
     Args:
-        returns: R_t, rewards inside the option, discounted from its start, (T,).
-        discounts: gamma ** tau_t, (T,).
-        values: V(s_t), (T,).
-        next_values: V of the state reached, (T,).
-        terminated: nothing follows the state reached, (T,).
-        ended: the episode ended there, for whatever reason, (T,).
+        returns: R_t, float64 (T,), the rewards inside the option, discounted from the option's start.
+        discounts: gamma ** tau_t, float64 (T,).
+        values: V(s_t), float64 (T,).
+        next_values: V(s'_t) of the state reached, float64 (T,).
+        terminated: bool (T,), whether nothing follows the state reached.
+        ended: bool (T,), whether the episode ended in the state reached, for whatever reason.
         trace: lambda.
 
     Returns:
-        A_t, (T,).
+        A_t, float64 (T,).
 
     Source: Schulman et al. 2016 (GAE) with the SMDP discount of Sutton, Precup and Singh 1999.
     """
@@ -43,10 +43,10 @@ def smdp_advantages(
 
 
 def scaled_advantages(advantages: Doubles, floor: float) -> Doubles:
-    """Advantages (n,) less their mean, in units of their standard deviation, or of ``floor`` where that is larger.
+    """Return advantages (n,) less their mean, divided by their standard deviation or by ``floor``, whichever is larger.
 
-    Without a floor the noise of a batch without rewards is blown up to the size of a signal, and the policy drifts
-    until it is sure of something arbitrary.
+    Without a floor the noise of a batch without rewards would be blown up to the size of a signal, and the policy would
+    drift until it is sure of something arbitrary.
     """
     return (advantages - advantages.mean()) / max(
         float(advantages.std()),
@@ -56,6 +56,9 @@ def scaled_advantages(advantages: Doubles, floor: float) -> Doubles:
 
 
 def explained_variance(values: Doubles, returns: Doubles) -> float:
-    """The share of the variance of returns (n,) that their predictions (n,) explain; 0 where returns do not vary."""
+    """Return the share of the variance of returns (n,) that their predictions ``values`` (n,) explain.
+
+    The share is 0 if the returns do not vary.
+    """
     variance = float(returns.var())
     return 1 - float((returns - values).var()) / variance if variance > 0 else 0.0

@@ -1,11 +1,11 @@
-"""An agent trained for a number of steps: what ``train-options`` and ``train-meta`` share.
+"""The training of an agent for a number of steps, which ``train-options`` and ``train-meta`` share.
 
-- step: one primitive action in one environment. Budgets, logs and curves count these.
-- joint step: a step in each of the E environments at once, so E steps: one call of ``OptionLoop.step``.
-- update: of the option policies, one gradient step on a batch of replayed steps, every ``update_interval`` steps; of
-  the meta-policy, ``epochs`` passes over the last ``decisions`` decisions.
+- step: one primitive action in one environment. Budgets, logs and curves count steps.
+- joint step: a step in each of the E environments at once, so E steps. One call of ``OptionLoop.step`` is a joint step.
+- update of the option policies: one gradient step on a batch of replayed steps, every ``update_interval`` steps.
+- update of the meta-policy: ``epochs`` passes over the last ``decisions`` decisions.
 
-What an option's end means for each of those that learn stands in :mod:`hypogoal.options.loop`.
+:mod:`hypogoal.options.loop` says what an option's end means for each of the policies that learn.
 """
 
 from hypogoal.core.artefacts import Artefact
@@ -25,14 +25,15 @@ def train(
     checkpoints: Checkpoints,
     until: float = 0.0,
 ) -> bool:
-    """Step ``loop`` for ``steps`` more environment steps, from the last checkpoint on if there is one.
+    """Step ``loop`` for ``steps`` more environment steps. If there is a checkpoint, go on from it.
 
-    It ends earlier once a share ``until`` of the last episodes has succeeded (0: never); returns whether it has.
+    Training ends earlier once a share ``until`` of the last episodes has succeeded. With ``until`` 0, training never
+    ends earlier. Returns whether the share was reached.
     """
     recorder, begin = loop.recorder, loop.recorder.steps
     checkpoints = checkpoints if loop.engine.resumes else Checkpoints(None)
-    logged = begin  # the steps at the last line of the log
-    numbers = {}  # of the last updates
+    logged = begin  # the number of steps at the last line of the log
+    numbers = {}  # the numbers to log of the last updates
     saved = checkpoints.load()
     if saved:
         loop.restore(saved["loop"])
@@ -66,7 +67,7 @@ def train(
 
 
 def continue_with(loop: OptionLoop, trained: Artefact) -> None:
-    """Go on with the options of an artefact; replays start empty."""
+    """Load the options of the artefact ``trained`` into ``loop``, to go on learning. Replays start empty."""
     weights = load_tensors(trained.path / "options.safetensors")
     loop.learner.load(weights)
     loop.terminations.rule.load(weights)
