@@ -171,9 +171,7 @@ class AuditConfig(PracticeConfig):
         high=32_000,
     )
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
-    mask_reached: bool = setting(
-        False, "do not begin runs of a policy where its classifier's prediction is already positive"
-    )
+    mask_reached: bool = setting(False, "do not begin executions where the prediction is already positive")
     steps: int = setting(80_000, "environment steps, all policies together", unit="steps", low=1)
     chooser: str = setting(
         "even",

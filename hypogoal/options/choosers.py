@@ -1,4 +1,7 @@
-"""Who chooses options, and how ``train-options`` and the lower control do it, without learning which."""
+"""Choosers, which are policies over options. The choosers in this module do not learn.
+
+They are the choosers of ``train-options`` and of the lower control.
+"""
 
 from __future__ import annotations
 
@@ -27,25 +30,25 @@ CHOOSERS = {
     "symbols": "hypogoal.meta.symbols:SymbolsChooser",
 }
 
-Offered = Bools  # (n, O), the options that may be chosen
-FILE = "meta.safetensors"  # of a chooser's :meth:`Chooser.state` in an artefact
+Offered = Bools  # (n, O), whether each option may be chosen
+FILE = "meta.safetensors"  # the file with a chooser's :meth:`Chooser.state` in an artefact
 
 
 @dataclass(frozen=True)
 class Outcome(Columns):
-    """Finished option executions, arrays of length n."""
+    """Finished executions of options, as arrays of length n."""
 
-    environments: Ints  # in which they ran
-    options: Ints  # that they were of
-    began: Ints  # the states in which these were chosen
-    reached: Bools  # the options' own classifiers ended them
-    inside: Bools  # these were positive already where they began
-    returns: Doubles  # the environment's rewards inside the option, discounted from its start
-    durations: Ints  # tau, the options' steps
-    discounts: Doubles  # gamma ** tau, for the state reached
+    environments: Ints  # the environments in which the options ran
+    options: Ints  # the options that ran
+    began: Ints  # the states in which the options were chosen
+    reached: Bools  # whether the option's own classifier ended the execution
+    inside: Bools  # whether that classifier was positive already where the execution began
+    returns: Doubles  # the environment's rewards during the execution, discounted from its start
+    durations: Ints  # tau, the number of steps
+    discounts: Doubles  # gamma ** tau, the discount of the state reached
     next_ids: Ints  # the states reached
-    terminated: Bools  # the task is over, nothing follows
-    truncated: Bools  # the episode was cut, at its limit or because the next option begins at a start
+    terminated: Bools  # whether the task is over, so that nothing follows
+    truncated: Bools  # whether the episode was cut, at its limit or because the next option begins at a start state
 
 
 class Chooser(Part, ABC):
@@ -53,42 +56,49 @@ class Chooser(Part, ABC):
 
     @classmethod
     def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
-        """A fresh one that chooses among so many options; ``seed`` is of weights and draws."""
+        """Return a new chooser for ``options`` options.
+
+        ``seed`` is the seed of the chooser's weights and of its random choices.
+        """
         return cls()
 
     @staticmethod
     def reach(config: OptionConfig) -> int:
-        """How many states back the chooser looks; by default none."""
+        """Return how many states back the chooser looks. By default it looks at no earlier states."""
         return 0
 
     @abstractmethod
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
-        """For each of n environments in states ``ids`` one of the options offered, bool (n, O): int64 (n,)."""
+        """Choose an option for each of n environments, int64 (n,).
+
+        ``environments`` are the numbers of the environments, and ``ids`` are their states. Only options may be chosen
+        for which ``offered``, bool (n, O), is true.
+        """
 
     def record(self, outcome: Outcome) -> None:
-        """The chosen options ended as ``outcome`` says; by default nothing is remembered."""
+        """Learn that the chosen options ended as ``outcome`` says. By default nothing is remembered."""
 
     def begin_anew(self) -> None:
-        """Forget the episodes that were broken off: all environments are at the beginning of one."""
+        """Forget the episodes that were broken off, because all environments are now at the beginning of an episode."""
 
     def learn(self) -> dict[str, float]:
-        """The updates that are due; returns numbers to log, empty when none was due."""
+        """Make the updates that are due. Return numbers to log, an empty dictionary if no update was due."""
         return {}
 
     def state(self) -> dict[str, Tensor]:
-        """Weights, for an artefact."""
+        """Return the weights that an artefact keeps, by name."""
         return {}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Weights of an artefact; by default there are none."""
+        """Load the weights of an artefact. By default there are none."""
 
     def carry(self, state: Mapping[str, Tensor]) -> None:
-        """Go on learning, elsewhere, from weights of an artefact; by default from all of them."""
+        """Load the weights of an artefact to go on learning elsewhere. By default all weights are loaded."""
         self.load(state)
 
 
 class RandomChooser(Chooser):
-    """Uniform choice among the options offered, the lower control and the way of ``train-options``."""
+    """A chooser that draws uniformly among the options offered, as in ``train-options`` and in the lower control."""
 
     CHANGING = ("rng",)
 
@@ -104,23 +114,24 @@ class RandomChooser(Chooser):
 
 
 class EvenChooser(Chooser):
-    """The offered option that has had the fewest steps so far, ties broken by ``rng``.
+    """A chooser that takes the offered option with the fewest steps so far, and breaks ties by ``rng``.
 
-    Uniform choice gives most steps to the options that never reach their sub-goal: their executions are the longest.
+    A uniform choice would give most steps to the options that never reach their sub-goal, because their executions are
+    the longest.
     """
 
     CHANGING = ("rng", "steps")
 
     def __init__(self, rng: np.random.Generator, options: int):
         self.rng = rng
-        self.steps = np.zeros(options, int)  # of each option so far
+        self.steps = np.zeros(options, int)  # the number of steps of each option so far
 
     @classmethod
     def create(cls, engine: Engine, options: int, config: OptionConfig, seed: int, device: str) -> Self:
         return cls(rng_for(seed, "random-choice"), options)
 
     def choose(self, environments: Ints, ids: Ints, offered: Offered) -> Ints:
-        """For each environment in turn, int64 (n,); an option that runs counts as one step more."""
+        """Choose for each environment in turn, int64 (n,). An option that begins to run counts as one step more."""
         chosen = np.empty(len(environments), int)
         for row in range(len(environments)):
             tied = self.steps + self.rng.random(len(self.steps))
@@ -129,10 +140,10 @@ class EvenChooser(Chooser):
         return chosen
 
     def record(self, outcome: Outcome) -> None:
-        """The steps that the options took."""
+        """Count the steps that the options took."""
         np.add.at(self.steps, outcome.options, outcome.durations - 1)
 
 
 def load_chooser(name: str) -> type[Chooser]:
-    """The class that the setting ``chooser`` names; a ``UserError`` where it names none."""
+    """Return the class that the setting ``chooser`` names. Raises ``UserError`` if there is no such class."""
     return load_class(name, "chooser", Chooser, CHOOSERS)  # type: ignore[type-abstract]

@@ -1,4 +1,4 @@
-"""How the intra-option policies explore: when a random action is played in place of their own."""
+"""Exploration of the intra-option policies: when a random action is played in place of the policy's action."""
 
 import numpy as np
 
@@ -6,19 +6,20 @@ from hypogoal.core.arrays import Doubles, Ints
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.options.config import LearnerConfig
 
-EXPONENT, LONGEST = 2.0, 10_000  # of how long a random action lasts, P(n) ~ n^-2, at most so many steps
+EXPONENT, LONGEST = 2.0, 10_000  # a random action lasts n steps with P(n) ~ n^-EXPONENT, at most LONGEST steps
 
 
 class Exploration(Resumable):
-    """Random actions, of A, in place of a policy's own, for each of E environments.
+    """Random actions in place of a policy's actions, in each of E environments.
 
-    ``independent``: at each step with probability epsilon, one action for one step. ``persistent``: epsilon-z-greedy
-    exploration; with probability epsilon a random action begins and lasts n steps, but not beyond its execution's end.
+    With ``independent`` exploration, a random action is played at each step with probability epsilon, for one step.
+    With ``persistent`` exploration (epsilon-z-greedy exploration), a random action begins with probability epsilon and
+    lasts n steps, but not beyond the end of its execution.
 
     Source: Dabney, Ostrovski and Barreto 2020, Temporally-Extended epsilon-Greedy Exploration.
     """
 
-    CHANGING = ("kept", "left")  # the generator is its owner's
+    CHANGING = ("kept", "left")  # not the generator, which its owner saves
 
     def __init__(
         self,
@@ -29,7 +30,7 @@ class Exploration(Resumable):
     ):
         self.actions, self.rng = actions, rng
         self.persistent = config.exploration == "persistent"
-        self.kept, self.left = np.zeros((2, environments), int)  # random actions, and for how many steps these last
+        self.kept, self.left = np.zeros((2, environments), int)  # random actions, and how many more steps they last
 
     def mix(
         self,
@@ -37,8 +38,10 @@ class Exploration(Resumable):
         epsilon: Doubles,
         age: Ints,
     ) -> Ints:
-        """Actions int64 (E,): the policy's (E,), or random ones, by ``epsilon`` (E,), ``age`` (E,) steps after
-        executions began.
+        """Return the actions to play, int64 (E,): the actions of ``policy`` (E,), or random actions.
+
+        ``epsilon`` (E,) are the probabilities of exploration. ``age`` (E,) is the number of steps since each execution
+        began.
         """
         count = len(policy)
         begins = self.rng.random(count) < epsilon

@@ -1,4 +1,4 @@
-"""What all learners of intra-option policies do: act, explore, count, and keep it in artefacts."""
+"""The base of all learners of intra-option policies: they act, explore, count steps, and are kept in artefacts."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -30,34 +30,35 @@ LEARNERS = {
 
 @dataclass(frozen=True)
 class Transitions(Columns):
-    """One step of every environment, arrays (E,): what intra-option policies learn from."""
+    """One step of every environment, as arrays (E,), from which intra-option policies learn."""
 
     ids: Ints
     actions: Ints
     next_ids: Ints
     rewards: Floats
-    options: Ints  # that were running
-    terminated: Bools  # the task is over
-    reached: Bools  # the option reached its sub-goal
-    timed_out: Bools  # its time was up without that
-    ended: Bools  # it stopped here for whatever reason
+    options: Ints  # the options that were running
+    terminated: Bools  # whether the task is over
+    reached: Bools  # whether the option reached its sub-goal
+    timed_out: Bools  # whether the option's time was up before it reached its sub-goal
+    ended: Bools  # whether the option stopped here, for whatever reason
 
 
 class Learner(Part, ABC):
-    """The intra-option policies of all O options.
+    """The intra-option policies of all O options, and how they are learned.
 
     Attributes:
         config: how options are executed.
-        settings: how these policies learn, the part ``config.learner``.
-        option_steps: int64 (O,), the steps that each learned from.
-        positives: int64 (O,), those of them at whose end its sub-goal was reached.
-        steps_since_positive: int64 (O,), those since the first one of these, also in a run that this one continues.
+        settings: how the policies learn, which is the part ``config.learner``.
+        option_steps: int64 (O,), the number of steps from which each option's policy learned.
+        positives: int64 (O,), the number of those steps at whose end the option's sub-goal was reached.
+        steps_since_positive: int64 (O,), the number of steps since the first step at whose end the sub-goal was
+            reached. Steps of a run that this run continues are included.
 
     Raises:
-        UserError: settings that do not go together, or a replay longer than the engine's memory of states.
+        UserError: if settings do not go together, or if the replay is longer than the engine's memory of states.
     """
 
-    KEPT = ("option_steps", "steps_since_positive")  # in artefacts, beside the weights
+    KEPT = ("option_steps", "steps_since_positive")  # what artefacts keep beside the weights
     CHANGING: ClassVar[tuple[str, ...]] = ("exploration", "rng", "positives", *KEPT)
 
     def __init__(
@@ -88,7 +89,7 @@ class Learner(Part, ABC):
 
     @classmethod
     def policies(cls, options: saved.SavedOptions) -> saved.Policies:
-        """Greedy policies of an artefact; where they need an engine it is a ``UserError``."""
+        """Return the greedy policies of an artefact's options. Raises ``UserError`` if the policies need an engine."""
         raise UserError(
             "these options need their domain's engine, which is not in the artefact",
             f"network={options.config['network']}",
@@ -97,40 +98,46 @@ class Learner(Part, ABC):
 
     @abstractmethod
     def build(self, config: OptionConfig, seed: int) -> None:
-        """The policies, once all above is there."""
+        """Build the policies. This is called once all other attributes are set."""
 
     @staticmethod
     @abstractmethod
     def reach(config: OptionConfig, options: int) -> int:
-        """How many states back the learner looks."""
+        """Return how many states back the learner looks."""
 
     @abstractmethod
     def greedy(self, ids: Ints, options: Ints, age: Ints) -> Ints:
-        """Which action each option's policy prefers, int64 (E,); arguments as of :meth:`act`."""
+        """Return the action that each running option's policy prefers, int64 (E,).
+
+        The arguments are those of :meth:`act`.
+        """
 
     @abstractmethod
     def observe(self, moved: Transitions) -> None:
         """Store one step of every environment."""
 
     def learn(self) -> dict[str, float]:
-        """As many updates as are due; returns the last one's numbers, empty when none was due, as by default."""
+        """Make as many updates as are due. Return the numbers of the last update.
+
+        The result is an empty dictionary if no update was due. By default there are no updates.
+        """
         return {}
 
     def weights(self) -> dict[str, Tensor]:
-        """Of all policies, by name; by default there are none."""
+        """Return the weights of all policies, by name. By default there are none."""
         return {}
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Those of :meth:`weights` among tensors of an artefact."""
+        """Load the weights that :meth:`weights` returns, from the tensors of an artefact."""
 
     def epsilon(self) -> Doubles:
-        """Every option's exploration, float (O,)."""
+        """Return every option's probability of exploration, float64 (O,)."""
         settings = self.config.part(LearnerConfig)
         steps = self.steps_since_positive if settings.epsilon_from == "first-positive" else self.option_steps
         return double_dqn.linear_epsilon(steps, settings.epsilon_steps, settings.epsilon_final)
 
     def health(self, last: double_dqn.Updated, replay: int) -> dict[str, float]:
-        """Numbers to log of the last update, and of a replay with so many transitions."""
+        """Return numbers to log of the last update, and of a replay with ``replay`` transitions."""
         return {
             "option_loss": last.loss,
             "option_q": last.q,
@@ -140,7 +147,10 @@ class Learner(Part, ABC):
         }
 
     def act(self, ids: Ints, options: Ints, age: Ints, *, explore: bool = True) -> Ints:
-        """Actions int64 (E,) of the running options (E,) in states (E,), ``age`` (E,) steps after they began."""
+        """Return the actions, int64 (E,), of the running ``options`` (E,) in states ``ids`` (E,).
+
+        ``age`` (E,) is the number of steps since each option began. Without ``explore``, the actions are greedy.
+        """
         chosen = self.greedy(ids, options.copy(), age.copy())
         chosen = answer_of(self, "greedy", chosen, int, len(ids), self.engine.n_actions - 1)
         if explore and self.settings:
@@ -148,19 +158,23 @@ class Learner(Part, ABC):
         return chosen
 
     def count(self, options: Ints) -> None:
-        """Steps of these options (n,) were learned from, after those that reached their sub-goals are counted."""
+        """Count one step of learning for each of ``options`` (n,).
+
+        Call this after ``positives`` has been updated.
+        """
         np.add.at(self.option_steps, options, 1)
         reached = (self.positives > 0) | (self.steps_since_positive > 0)
         np.add.at(self.steps_since_positive, options, reached[options])
 
     def state(self) -> dict[str, Tensor]:
-        """Weights and exploration counters, for an artefact."""
+        """Return the weights and the exploration counters that an artefact keeps, by name."""
         counters = {name: torch.from_numpy(getattr(self, name).copy()) for name in self.KEPT}
         return self.weights() | counters
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Continue from the weights and counters of an artefact; replays start empty. What does not fit is a
-        ``UserError``.
+        """Load the weights and counters of an artefact, to go on learning. Replays start empty.
+
+        Raises ``UserError`` if the weights or counters do not fit.
         """
         self.load_weights(state)
         for name in self.KEPT:
@@ -168,12 +182,16 @@ class Learner(Part, ABC):
 
 
 def load_learner(name: str) -> type[Learner]:
-    """The class that the setting ``network`` names; a ``UserError`` where it names none."""
+    """Return the class that the setting ``network`` names. Raises ``UserError`` if there is no such class."""
     return load_class(name, "option learner", Learner, LEARNERS)  # type: ignore[type-abstract]
 
 
 def make_policies(config: Values, weights: Mapping[str, Tensor], ensemble_config: Values) -> saved.Policies:
-    """Greedy policies from an options artefact's configuration and weights and its ensembles' configuration."""
+    """Return the greedy policies of an options artefact.
+
+    ``config`` and ``weights`` are those of the artefact. ``ensemble_config`` is the configuration of its ensembles.
+    Raises ``UserError`` if the options end at true sub-goals, or if the policies need an engine.
+    """
     if config["termination"] == ORACLE:
         raise UserError(
             "these options end at the true sub-goals, which only the domain's engine can see",

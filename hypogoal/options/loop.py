@@ -1,26 +1,29 @@
-"""Options at work: many environments, each running one option at a time.
+"""Options at work: many environments, each of which runs one option at a time.
 
-The loop knows nothing of how options are chosen or learned: it asks a chooser and a learner. It works in these steps:
+The loop does not know how options are chosen or learned, because it asks a chooser and a learner. Its words are:
 
 - decision: a chooser takes one of the options offered.
-- execution: that option at work, from the state in which it was chosen. It takes tau steps, at least one.
-- outcome: what came of it: its first state, R (the rewards inside, discounted from its start), gamma ** tau, the state
-  in which it ended. The policy over options learns from these alone.
+- execution: the option runs, from the state in which it was chosen. An execution takes tau steps, at least one.
+- outcome: what came of the execution. The outcome has its first state, R (the rewards inside, discounted from the start
+  of the execution), gamma ** tau, and the state in which the execution ended. The policy over options learns from
+  outcomes alone.
 
-An execution ends at the first of three things. They are not exclusive, and each is told to those that learn:
+An execution ends at the first of three events. Several of the events can happen at once, and each is told to the
+policies that learn:
 
-- ``reached``: the rule (:mod:`.termination`) says so of the state that it came to. For the option's policy that is a
-  terminal state, with a reward of 1. For the policy over options it is a state like any other: its value counts.
-- ``timed_out``: it has taken ``option_timeout`` steps, and the episode goes on. The option's policy is rewarded 0.
-  Time is not part of a state, so its target is the value of that state, as if it went on; a return over several steps
-  ends there, too. The policy over options takes R + gamma ** tau V(s'), and its trace runs on into the next decision,
-  which is made in the same state: the same option may be chosen again.
-- the episode ends. ``terminated``: the task is over, so the values of what follows are 0 for both policies.
-  ``truncated``: the episode is cut, at its ``max_episode_steps`` or at its cap. That is no terminal state, so the
-  value of the state counts for both policies, but the trace of the policy over options ends.
+- ``reached``: the rule (:mod:`.termination`) says that the state reached ends the option. For the option's policy, that
+  is a terminal state with a reward of 1. For the policy over options, it is a state like any other, so its value
+  counts.
+- ``timed_out``: the execution has taken ``option_timeout`` steps, and the episode goes on. The option's policy is
+  rewarded 0. Time is not part of a state, so the target of learning is the value of the state, as if the execution went
+  on. A return over several steps ends there, too. The policy over options takes R + gamma ** tau V(s'), and its trace
+  runs on into the next decision. The next decision is made in that state, and may choose the same option again.
+- the episode ends. If it is ``terminated``, the task is over, so the values of what follows are 0 for both policies. If
+  it is ``truncated``, the episode is cut, at its ``max_episode_steps`` or at its cap. A cut is no terminal state, so
+  the value of the state counts for both policies, but the trace of the policy over options ends.
 
-With ``restart_options`` the end of an execution is that of its episode, too: the episode counts as cut.
-With ``experience=shared`` every member of a sub-goal learns from a step, each by its own prediction of the state.
+With ``restart_options``, the end of an execution is also the end of its episode, and the episode counts as cut. With
+``experience=shared``, every member of a sub-goal learns from each step, each member by its own prediction of the state.
 """
 
 from dataclasses import dataclass
@@ -43,7 +46,10 @@ NONE = -1
 
 
 def offered_options(predictions: Bools) -> Bools:
-    """Options whose sub-goal does not hold yet; all of them where none would be left. bool (n, O)."""
+    """Return which options are offered, bool (n, O): the options whose sub-goal does not hold yet.
+
+    Where the sub-goals of all options hold, all options are offered.
+    """
     offered = ~predictions
     offered[~offered.any(1)] = True
     return offered
@@ -51,11 +57,20 @@ def offered_options(predictions: Bools) -> Bools:
 
 @dataclass(eq=False, repr=False)
 class OptionLoop(Resumable):
-    """Steps every environment once per call of :meth:`step`.
+    """A loop that plays options in many environments, and steps every environment once per call of :meth:`step`.
 
-    Episodes and choices are told to ``recorder``; ``config`` has timeouts, masks and whether options begin at start
-    states, a ``UserError`` where the engine cannot begin an episode when asked. ``gamma`` is the meta-level's discount
-    per environment step (E1). ``visited`` is shown every state (B7).
+    Attributes:
+        engine: the environments.
+        terminations: says where the options' sub-goals hold, and ends executions.
+        learner: the policies of the options.
+        chooser: the policy over options.
+        recorder: is told of episodes and choices.
+        config: timeouts, masks, and whether options begin at start states.
+        gamma: the meta-level's discount per environment step.
+        visited: is shown every state. None: nothing is kept.
+
+    Raises:
+        UserError: if ``config.restart_options`` is set, and the engine cannot begin an episode on request.
     """
 
     CHANGING = (
@@ -90,13 +105,16 @@ class OptionLoop(Resumable):
             )
         count = self.engine.count
         self.option = np.full(count, NONE)
-        self.began, self.age = np.zeros((2, count), int)  # states in which options were chosen; steps since
-        self.inside = np.zeros(count, bool)  # the running option's own sub-goal held where it began
+        self.began, self.age = np.zeros((2, count), int)  # the states in which options were chosen, and steps since
+        self.inside = np.zeros(count, bool)  # whether the running option's sub-goal held in the state where it began
         self.returns = np.zeros(count)
         self._reset()
 
     def begin_anew(self, chooser: Chooser) -> None:
-        """Begin an episode in every environment, with this chooser; of earlier episodes and options nothing is left."""
+        """Begin an episode in every environment, with ``chooser``.
+
+        Nothing of earlier episodes and executions is kept.
+        """
         chooser.begin_anew()
         self.chooser, self.recorder = chooser, Recorder(self.recorder.options, self.engine)
         self.option[:] = NONE
@@ -107,20 +125,21 @@ class OptionLoop(Resumable):
         self.terminations.rule.begin_episodes(np.arange(self.engine.count))
 
     def offered(self, ids: Ints) -> Bools:
-        """Which options may begin in states (n,): bool (n, O)."""
+        """Return which options may begin in states ``ids`` (n,), bool (n, O)."""
         if not self.config.mask_reached:
             return np.ones((len(ids), self.terminations.options), bool)
         return offered_options(self.terminations.of(ids))
 
     def step(self) -> dict[str, float]:
-        """One step of every environment, then the updates that are due; returns numbers to log."""
+        """Step every environment once, and then make the updates that are due. Return numbers to log."""
         self.advance()
         return learned_by(self.learner) | learned_by(self.chooser)
 
     def advance(self, *, learning: bool = True) -> Transitions:
-        """One step of every environment, before the updates that are due.
+        """Step every environment once, without the updates that are due. Return what happened.
 
-        Without ``learning`` the agent is frozen: options are greedy, and nothing is kept that could be learned from.
+        Without ``learning`` the agent is frozen: options are greedy, and nothing is kept from which the agent could
+        learn.
         """
         self._choose(learning)
         ids, option = self.engine.ids.copy(), self.option.copy()
@@ -133,7 +152,7 @@ class OptionLoop(Resumable):
         self.age += 1
         over = step.terminated | step.truncated
         timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
-        ended = reached | timed_out | over  # all that ends an option
+        ended = reached | timed_out | over  # each of the three events ends an execution
         moved = Transitions(
             ids,
             actions,

@@ -1,4 +1,4 @@
-"""Q-networks of the intra-option policies: a small one on cells, or on pictures."""
+"""Q-networks of the intra-option policies: a small network on cells, or on pictures."""
 
 from typing import Any
 
@@ -12,16 +12,16 @@ from hypogoal.domains.base import Engine
 from hypogoal.hypotheses.networks import AUTO, as_input, build_network
 from hypogoal.observations import Shape, Standard, standardised
 
-CELL = 8  # pixels
-WIDTH = 128  # of dense layers
-SMALLEST = 18  # pixels that the convolutions of a PictureEmbedding need
+CELL = 8  # pixels of a cell's side
+WIDTH = 128  # the number of units of a dense layer
+SMALLEST = 18  # the fewest pixels of a side that the convolutions of a PictureEmbedding need
 
 
 class CellEmbedding(nn.Module):
-    """A convolution whose kernel and stride are one cell (8 pixels), to ``CHANNELS`` features each, then ReLU.
+    """A convolution whose kernel and stride are one cell (8 pixels), to ``CHANNELS`` features for each cell, then ReLU.
 
-    Images made of few distinct tiles are looked up: each tile is convolved once, its features gathered by tile code.
-    The values and gradients are the same.
+    If images are made of few distinct tiles, features are looked up: each tile is convolved once, and its features are
+    gathered by tile code. Values and gradients do not differ from those of the convolution.
     """
 
     CHANNELS = 8
@@ -40,9 +40,9 @@ class CellEmbedding(nn.Module):
         self._pixels = torch.empty(0)
 
     def forward(self, images: Tensor, tiles: Bytes | None = None) -> Tensor:
-        """uint8 (N, H, W, C) -> float32 (N, features), cells row by row.
+        """Return features, float32 (N, features), of images uint8 (N, H, W, C), cells row by row.
 
-        With ``tiles``, uint8 (T, 8, 8, C), the images are cells' codes instead, integers (N, cells).
+        If ``tiles``, uint8 (T, 8, 8, C), are given, ``images`` are the codes of cells instead, integers (N, cells).
         """
         if tiles is not None:
             return self._looked_up(images, tiles)
@@ -55,15 +55,16 @@ class CellEmbedding(nn.Module):
             pixels = tensor(tiles.copy(), self.conv.weight.device)
             self._pixels = as_input(pixels).flatten(1)
         table = torch.relu(nn.functional.linear(self._pixels, self.conv.weight.flatten(1), self.conv.bias))
-        # index_select, not embedding: the same, and its gradient takes a sixth of the time.
+        # index_select gives what embedding gives, and its gradient takes a sixth of the time.
         return table.index_select(0, codes.flatten().long()).view(len(codes), -1)
 
 
 class PictureEmbedding(nn.Module):
     """Two convolutions with ReLU, for pictures that are not made of cells.
 
-    For (84, 84, 4), in one thread, an update with these kernels takes half the time of the usual 8x8/4 and 4x4/2.
-    Where strides would not reach the last pixels, there is a margin of zeros, which costs less than to pad the pixels.
+    For (84, 84, 4), in one thread, an update with these kernels takes half the time of the usual kernels 8x8/4 and
+    4x4/2. Where strides would not reach the last pixels, there is a margin of zeros, because that costs less than
+    padding the pixels.
     """
 
     def __init__(self, observation_shape: Shape):
@@ -88,9 +89,9 @@ class PictureEmbedding(nn.Module):
             self.features = self.second(self.first(blank)).numel()
 
     def forward(self, images: Tensor) -> Tensor:
-        """uint8 or float32 (N, H, W, C), 0 to 255 -> float32 (N, features)."""
+        """Return features, float32 (N, features), of images uint8 or float32 (N, H, W, C) in 0..255."""
         pixels = images.permute(0, 3, 1, 2).float()
-        # The first weights are scaled instead of the pixels: the same function, on a thousandth of the numbers.
+        # The first weights are scaled instead of the pixels, because there are a thousand times fewer of them.
         layer = self.first
         first = nn.functional.conv2d(
             pixels,
@@ -103,7 +104,7 @@ class PictureEmbedding(nn.Module):
 
 
 class NumberEmbedding(nn.Module):
-    """Observations that are no pictures: each number's deviations from a mean."""
+    """An embedding of observations that are no pictures: each number, standardised by a mean and a deviation."""
 
     mean: Tensor
     deviation: Tensor
@@ -114,14 +115,15 @@ class NumberEmbedding(nn.Module):
         self.features = self.mean.numel()
 
     def forward(self, observations: Tensor) -> Any:
-        """float32 (N, *shape) -> float32 (N, features)."""
+        """Return features, float32 (N, features), of observations float32 (N, *shape)."""
         return standardised(observations, self.mean, self.deviation).flatten(1)
 
 
 class OwnEmbedding(nn.Module):
     """A member network by name (see :mod:`hypogoal.hypotheses.networks`) up to its last hidden layer, or an encoder.
 
-    It stays in evaluation mode: what BatchNorm and Dropout make of a state depends on no other state.
+    The embedding stays in evaluation mode, so that what BatchNorm and Dropout make of a state depends on no other
+    state.
     """
 
     mean: Tensor
@@ -143,14 +145,17 @@ class OwnEmbedding(nn.Module):
         self.encoder, self.features = network[:-1].eval(), last.in_features
 
     def forward(self, observations: Tensor) -> Any:
-        """uint8 (N, H, W, C), or float32 (N, *shape) where there is a standard -> float32 (N, features)."""
+        """Return features, float32 (N, features).
+
+        Observations are uint8 (N, H, W, C), or float32 (N, *shape) if there is a standard.
+        """
         if self.standardises:
             observations = standardised(observations, self.mean, self.deviation)
         return self.encoder(as_input(observations))
 
 
 def keep_standard(embedding: nn.Module, standard: Standard) -> None:
-    """Keep mean and deviation of numbers among an embedding's weights."""
+    """Keep the mean and deviation of numbers among an embedding's weights."""
     for name, values in zip(("mean", "deviation"), standard, strict=True):
         embedding.register_buffer(name, torch.from_numpy(values.copy()))
 
@@ -159,10 +164,10 @@ Embedding = CellEmbedding | PictureEmbedding | NumberEmbedding | OwnEmbedding
 
 
 def embedding_for(observation_shape: Shape, standard: Standard | None, name: str) -> Embedding:
-    """The embedding of this ``name``; a ``UserError`` where the observations do not suit it.
+    """Return the embedding named ``name``. Raises ``UserError`` if it does not suit the observations.
 
-    ``auto`` is numbers where there is a ``standard``, else cells, or convolutions where whole cells do not fill the
-    image.
+    ``auto`` is an embedding of numbers if there is a ``standard``. Otherwise ``auto`` is an embedding of cells, or of
+    convolutions if whole cells do not fill the image.
     """
     if name != AUTO:
         return OwnEmbedding(name, observation_shape, standard)
@@ -180,7 +185,7 @@ def embedding_for(observation_shape: Shape, standard: Standard | None, name: str
 
 
 class LightNetwork(nn.Module):
-    """An embedding and two dense layers."""
+    """An embedding followed by two dense layers."""
 
     def __init__(self, cells: Embedding):
         super().__init__()
@@ -193,16 +198,19 @@ class LightNetwork(nn.Module):
         )
 
     def forward(self, *seen: Any) -> Tensor:
-        """What :meth:`head` gives for observations (N, *obs), or for tile codes and the tiles."""
+        """Return what :meth:`head` gives for observations (N, *obs), or for tile codes and the tiles."""
         return self.head(self.trunk(self.cells(*seen)))
 
     def head(self, features: Tensor) -> Tensor:
-        """The network's outputs, from float32 (N, width)."""
+        """Return the network's outputs, from features float32 (N, width)."""
         raise NotImplementedError
 
 
 class LightQNetwork(LightNetwork):
-    """One trunk and a head per member: values float32 (N, members, actions) of every member's policy."""
+    """A Q-network with one trunk, and one head for each member.
+
+    Its outputs are the values of every member's policy, float32 (N, members, actions).
+    """
 
     def __init__(
         self,
@@ -217,7 +225,7 @@ class LightQNetwork(LightNetwork):
         self.heads = nn.Linear(WIDTH, members * actions)
 
     def head(self, features: Tensor) -> Tensor:
-        """float32 (N, members, actions)."""
+        """Return values, float32 (N, members, actions), from features float32 (N, width)."""
         return self.heads(features).view(-1, self.members, self.actions)
 
 
@@ -227,7 +235,10 @@ def apply_to_states(
     ids: Ints,
     device: torch.device,
 ) -> Tensor:
-    """Output of a network on ``device`` for states of an engine: by tile codes where both know them, else by images."""
+    """Return the output of a network on ``device`` for states of an engine.
+
+    The network reads tile codes if both the network and the engine know tiles, otherwise images.
+    """
     tiles = engine.tiles
     if tiles is not None and isinstance(getattr(network, "cells", None), CellEmbedding):
         codes = tensor(engine.codes(ids).astype(int), device)
@@ -243,20 +254,24 @@ def values_of(
     next_states: Ints,
     device: torch.device,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The online network in states (with gradients) and in next states, the target in these; (n, O, A) each."""
+    """Return three tensors of values, each float32 (n, O, A).
+
+    The first tensor has the online network's values in ``states``, with gradients. The second and the third tensor have
+    the online and the target network's values in ``next_states``.
+    """
     both = np.concatenate([states, next_states])
-    if isinstance(online.cells, PictureEmbedding):  # whose states hardly ever occur twice
+    if isinstance(online.cells, PictureEmbedding):  # such states hardly ever occur twice
         now, later = tensor(engine.images(both), device).float().split(len(states))
         with torch.no_grad():
             next_online = online(later)
             next_target = target(later)
         return online(now), next_online, next_target
-    # A batch has few distinct states, late in training 40 of 256: the networks see each once.
+    # A batch has few distinct states, late in training 40 of 256. So the networks see each distinct state once.
     distinct, places = np.unique(both, return_inverse=True)
     before, after = tensor(places, device).split(len(states))
     values = apply_to_states(online, engine, distinct, device)
     others = apply_to_states(target, engine, distinct, device)
-    # index_select, not indexing, whose gradient takes several times as long.
+    # index_select is used because the gradient of indexing takes several times as long.
     now = values.index_select(0, before)
     next_online = values.detach().index_select(0, after)
     next_target = others.index_select(0, after)

@@ -1,4 +1,4 @@
-"""Parts of an agent that a setting names: choosers, learners, termination rules."""
+"""Parts of an agent that a setting names: choosers, learners and termination rules."""
 
 from __future__ import annotations
 
@@ -20,15 +20,21 @@ if TYPE_CHECKING:
 
 
 class Part(Resumable):
-    """A part of an agent. Its class knows which settings and engines it works with."""
+    """A part of an agent. Its class knows with which settings and engines the part works."""
 
     @classmethod
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
-        """Raise a ``UserError`` where it does not work with these settings in this engine; by default it does."""
+        """Raise ``UserError`` if the part does not work with the settings in the engine.
+
+        By default every part works.
+        """
 
 
 def answer_of(part: Part, method: str, values: Any, dtype: Any, count: int, most: int = 1) -> Array:
-    """What a part's method gave for each of ``count`` environments, from 0 to ``most``, else a ``UserError``."""
+    """Return what a part's method gave for each of ``count`` environments, as an array (count,).
+
+    Raises ``UserError`` if the answer has another shape or type, or is not within 0 to ``most``.
+    """
     given = np.asarray(values)
     kinds = "b" if dtype is bool else "iu"
     if given.shape != (count,) or given.dtype.kind not in kinds:
@@ -43,7 +49,7 @@ def answer_of(part: Part, method: str, values: Any, dtype: Any, count: int, most
 
 
 def learned_by(part: Any) -> dict[str, float]:
-    """The numbers of the updates that were due; anything but a dictionary is a ``UserError``."""
+    """Return the numbers of the updates that were due. Raises ``UserError`` if ``learn`` gives no dictionary."""
     numbers = part.learn()
     if not isinstance(numbers, dict):
         raise UserError(
@@ -55,7 +61,10 @@ def learned_by(part: Any) -> dict[str, float]:
 
 
 def saved_row(weights: Mapping[str, Tensor], name: str, options: int) -> Array:
-    """A number for each option (O,), of an artefact's weights; a ``UserError`` where they are missing."""
+    """Return the tensor ``name`` of an artefact's weights, which has one number for each option (O,).
+
+    Raises ``UserError`` if the tensor is missing or has another shape.
+    """
     row = weights.get(name)
     if row is None or row.shape != (options,):
         raise UserError(f"the weights do not fit the manifest (at {name})", f"{options} options", AGAIN)

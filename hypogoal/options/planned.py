@@ -1,7 +1,7 @@
-"""Options that are planned and not learned: the shortest way to where each member is positive, exactly.
+"""Options that are planned and not learned: they go the shortest way to where their member is positive, exactly.
 
-Where an engine knows what follows on each action, what an option does is a matter of its sub-goal alone. So an agent
-whose options are planned shows what its hypotheses are worth, whatever option learning makes of them.
+If an engine knows what follows on each action, what an option does depends on its sub-goal alone. So an agent whose
+options are planned shows what its hypotheses are worth, independently of how well options are learned.
 """
 
 import numpy as np
@@ -14,23 +14,23 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.termination import TerminationRule, Terminations
 
-FAR = np.iinfo(np.int32).max // 2  # steps to where nothing leads
+FAR = np.iinfo(np.int32).max // 2  # the number of steps to a place to which no way leads
 
 
 class PlannedLearner(Learner):
-    """Every option goes the shortest way to its own sub-goal; of equally short ones it takes the first action.
+    """A learner whose options go the shortest way to their sub-goals, and take the first of equally good actions.
 
-    Arguments as of :class:`Learner`. Where no way leads to its sub-goal it plays the first action.
+    The arguments are those of :class:`Learner`. If no way leads to its sub-goal, an option plays the first action.
 
     Attributes:
-        actions: the engine's actions that the plan knows, int64 (A,).
-        steps: int32 (N, O), how many steps each option's sub-goal is away from each state of the plan.
+        actions: int64 (A,), the engine's actions that the plan knows.
+        steps: int32 (N, O), the number of steps from each state of the plan to each option's sub-goal.
 
     Raises:
-        UserError: nobody knows what follows in this engine.
+        UserError: if the engine does not know what follows on each action.
     """
 
-    CHANGING = ("rng", "positives", *Learner.KEPT)  # it does not explore
+    CHANGING = ("rng", "positives", *Learner.KEPT)  # no exploration, because planned options do not explore
 
     def build(self, config: OptionConfig, seed: int) -> None:
         plan = plan_of(self.engine, self.terminations, config)
@@ -54,7 +54,7 @@ class PlannedLearner(Learner):
         return self.actions[nearest]
 
     def observe(self, moved: Transitions) -> None:
-        """Only counted."""
+        """Count the steps and the sub-goals reached, from which nothing else is learned."""
         reached = self.terminations.of_running(moved.next_ids, moved.options)
         np.add.at(self.positives, moved.options[reached], 1)
         self.count(moved.options)
@@ -66,7 +66,10 @@ def plan_of(
     config: OptionConfig,
     starts: Ints | None = None,
 ) -> Plan:
-    """The engine's plan, from these states or where episodes begin; a ``UserError`` where options cannot be planned."""
+    """Return the engine's plan, from the states ``starts`` or from where episodes begin.
+
+    Raises ``UserError`` if options cannot be planned.
+    """
     if type(terminations.rule) is not TerminationRule:
         fault = "only options that end at a single positive prediction can be planned"
         raise UserError(fault, f"termination={config.termination}", "Give termination=learned.")
@@ -78,17 +81,27 @@ def plan_of(
 
 
 def places_of(plan: Plan, engine: Engine) -> Ints:
-    """Where in a plan each of the engine's states is, int64 (n_states,); -1 of those that are not in it."""
+    """Return the index in the plan of each of the engine's states, int64 (n_states,).
+
+    The index is -1 for states that are not in the plan.
+    """
     places = np.full(engine.n_states, -1, int)
     places[plan.ids] = np.arange(len(plan.ids))
     return places
 
 
 def distances(reached: Bools, after: Ints, final: Bools) -> NDArray[np.int32]:
-    """Breadth-first search from all sub-goals at once, against the direction of time: steps to them, int32 (N, O).
+    """Return the number of steps from each state to each option's sub-goal, int32 (N, O).
 
-    0 where an option's sub-goal is ``reached`` (N, O), ``FAR`` where no way leads there; states ``after`` each action
-    are (N, A), and nothing follows a ``final`` one (N,).
+    The method is breadth-first search from all sub-goals at once, against the direction of time.
+
+    Args:
+        reached: bool (N, O), whether each option's sub-goal is reached. The number of steps is 0 there.
+        after: int64 (N, A), the state after each action.
+        final: bool (N,), whether nothing follows a state.
+
+    Returns:
+        The number of steps, or ``FAR`` where no way leads to the sub-goal.
     """
     steps = np.where(reached, 0, FAR).astype(np.int32)
     going = np.flatnonzero(~final)

@@ -1,4 +1,4 @@
-"""Greedy policies of options in an artefact, without an engine."""
+"""Greedy policies of the options in an artefact, which need no engine."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from hypogoal.core.tensors import below, load_fitting
 from hypogoal.observations import Observations, Shape, standard_of
 from hypogoal.options.networks import LightQNetwork
 
-FILE = "options.safetensors"  # of an artefact
-# Starts an execution of an option: gives a function from an observation (*obs) to the action.
+FILE = "options.safetensors"  # the file with the options' weights in an artefact
+# A function that starts an execution of an option and returns a function from an observation (*obs) to an action.
 Policies = Callable[[int], Callable[[Observations], int]]
 
 
 @dataclass(frozen=True)
 class SavedOptions:
-    """An artefact's options, on observations of this ``shape``."""
+    """The options of an artefact, for observations of shape ``shape``."""
 
     config: Mapping[str, Any]
     weights: Mapping[str, Tensor]
@@ -28,23 +28,23 @@ class SavedOptions:
 
     @property
     def count(self) -> int:
-        """How many options there are."""
+        """The number of options."""
         return len(self.config["sub_goals"]) * self.config["members"]
 
 
 class LightPolicies:
-    """Those of options that share a light network."""
+    """The greedy policies of options that share a light network."""
 
     def __init__(self, options: SavedOptions):
         weights = below("online.", options.weights)
         embedding = options.config["embedding"]
-        actions = len(weights.get("heads.weight", ())) // options.count or 1  # any, where weights are missing
-        standard = standard_of(options.shape) if "cells.mean" in weights else None  # the weights' own replaces it
+        actions = len(weights.get("heads.weight", ())) // options.count or 1  # 1 if weights are missing, refused below
+        standard = standard_of(options.shape) if "cells.mean" in weights else None  # replaced by that of the weights
         make = partial(LightQNetwork, options.shape, options.count, actions, standard, embedding)
         self.network = load_fitting(make, weights, FILE)
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
-        """Start an execution."""
+        """Start an execution of ``option``, and return the function from an observation to an action."""
         return partial(self._act, option)
 
     @torch.no_grad()

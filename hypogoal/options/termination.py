@@ -1,15 +1,16 @@
-"""What decides that an option ends: a rule, which every loop that plays options asks.
+"""Rules that decide when an option has reached its sub-goal. Every loop that plays options asks a rule.
 
-An execution ends at the first of three things (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance`` and
-``OptionEnv.step``): its sub-goal is reached, as :meth:`TerminationRule.reached` says; it has taken ``option_timeout``
-steps; its episode ends.
-By default the sub-goal is reached where the prediction of the option's own member is positive: where the member's
-log-odds lie above its threshold. Another rule is another subclass, named by the setting ``termination``; with
-``termination=oracle`` the sub-goals' true labels stand in for predictions.
+An execution ends at the first of three events (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance`` and
+``OptionEnv.step``). Its sub-goal is reached, as :meth:`TerminationRule.reached` says. Or the execution has taken
+``option_timeout`` steps. Or its episode ends.
 
-Inside an engine each state is judged once. Libraries round differently in batches of another size. So a member whose
-probability is at its threshold, to the last bits of a float32, may give a state another prediction in another batch.
-The first prediction stands, for a run and for what resumes it.
+By default the sub-goal is reached where the prediction of the option's own member is positive, which means that the
+member's log-odds lie above its threshold. Another rule is another subclass, which the setting ``termination`` names.
+With ``termination=oracle`` the sub-goals' true labels stand in for predictions.
+
+Inside an engine each state is judged once. The reason is that libraries round differently in batches of another size.
+So a member whose probability is at its threshold, to the last bits of a float32, may predict differently for a state in
+another batch. The first prediction stands, for a run and for a run that resumes it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,22 +28,27 @@ from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
 from hypogoal.options.parts import Part, saved_row
 
-THRESHOLDS = "thresholds"  # in an artefact: log-odds
-ORACLE = "oracle"  # the setting ``termination`` of options that end at true sub-goals
+THRESHOLDS = "thresholds"  # the name of the thresholds in an artefact, which are log-odds
+ORACLE = "oracle"  # the value of the setting ``termination`` for options that end at true sub-goals
 
 
 class TerminationRule(Part):
-    """An execution ends at the first state in which its own member's prediction is positive (the paper).
+    """The rule that an execution ends at the first state in which its own member's prediction is positive (the paper).
 
-    Other rules are subclasses: :meth:`reached`, asked at every step of training, of frozen play and of ``OptionEnv``,
-    and :meth:`finished`, called in training alone, where a rule learns from executions. What it keeps of a running
-    execution is by environment, and begins anew where ``age`` is 0; in ``OptionEnv``, which has its own object, E is 1.
-    What it learns goes into checkpoints by ``CHANGING`` and into artefacts by :meth:`state`. A rule ends executions;
-    rewards and targets of policies, and which options are offered, go by :meth:`positive`, of one state, all the same.
+    Other rules are subclasses. They override :meth:`reached`, which is called at every step of training, of frozen play
+    and of ``OptionEnv``. A rule that learns from executions also overrides :meth:`finished`, which is called in
+    training alone.
+
+    What a rule keeps of a running execution is kept by environment, and begins anew where ``age`` is 0. ``OptionEnv``
+    has a rule object of its own, in which E is 1. What a rule learns goes into checkpoints by ``CHANGING``, and into
+    artefacts by :meth:`state`.
+
+    A rule only ends executions. The rewards and targets of policies, and which options are offered, still follow
+    :meth:`positive`, which looks at one state.
 
     Args:
-        thresholds: float32 (O,), log-odds above which a prediction is positive.
-        environments: E.
+        thresholds: float32 (O,), the log-odds above which a prediction is positive.
+        environments: E, the number of environments.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = (THRESHOLDS,)
@@ -57,10 +63,10 @@ class TerminationRule(Part):
         options: Ints,
         age: Ints,
     ) -> Bools:
-        """Whether executions reach their sub-goals in the states they come to: bool (E,), called once a step.
+        """Return whether each execution reaches its sub-goal in the state to which it comes, bool (E,).
 
-        ``log_odds`` float32 (E,) are how sure the running ``options`` (E,) are of these states, ``age`` (E,) their
-        steps before this one.
+        The method is called once a step. ``log_odds``, float32 (E,), say how sure the running ``options`` (E,) are that
+        their sub-goal holds in the state. ``age`` (E,) is the number of steps that the execution took before this step.
         """
         return self.positive(log_odds, options)
 
@@ -70,31 +76,38 @@ class TerminationRule(Part):
         options: Ints,
         reached: Bools,
     ) -> None:
-        """Executions (n,) that ended in training, and which of them reached their sub-goals."""
+        """Learn that executions (n,) ended in training, and which of them reached their sub-goals.
+
+        By default nothing is done.
+        """
 
     def begin_episodes(self, environments: Ints) -> None:
-        """Episodes begin in these environments (n,), in training and in play; by default nothing is remembered."""
+        """Learn that episodes begin in ``environments`` (n,), in training or in play. By default nothing is done."""
 
     def positive(self, log_odds: Floats, options: Ints | slice = slice(None)) -> Bools:
-        """Predictions by today's thresholds, of options (n,), or of all where the log-odds are (n, O)."""
+        """Return whether predictions are positive by today's thresholds, in the shape of ``log_odds``.
+
+        ``log_odds`` are those of ``options`` (n,), or of all options if their shape is (n, O).
+        """
         return log_odds > self.thresholds[options]
 
     def state(self) -> dict[str, torch.Tensor]:
-        """What an artefact keeps."""
+        """Return what an artefact keeps, by name."""
         return {THRESHOLDS: torch.from_numpy(self.thresholds.copy())}
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Go on with what an artefact kept."""
+        """Load what an artefact kept, to go on from there."""
         self.thresholds = saved_row(state, THRESHOLDS, self.options)
 
 
 class Terminations(Resumable):
-    """Where the options' sub-goals hold in an engine, by its states' ids; each state is judged once.
+    """Answers where the options' sub-goals hold in an engine, by the ids of states. Each state is judged once.
 
     Args:
-        classify: state ids (n,) -> log-odds float32 (n, O).
-        rule: has the thresholds, and ends executions.
-        classify_one: state ids (n,) and an option -> its log-odds (n,); None: classify for all options.
+        classify: a function from state ids (n,) to log-odds float32 (n, O).
+        rule: the rule, which has the thresholds and ends executions.
+        classify_one: a function from state ids (n,) and an option to that option's log-odds (n,). With None,
+            ``classify`` is called for all options.
     """
 
     CHANGING = ("judged", "rule")
@@ -107,23 +120,26 @@ class Terminations(Resumable):
     ):
         self.classify, self.rule, self.classify_one = classify, rule, classify_one
         self.options = rule.options
-        self.judged = np.zeros((0, self.options), np.float32)  # log-odds of states by id; NaN: not judged yet
+        self.judged = np.zeros((0, self.options), np.float32)  # log-odds by state id, NaN where not judged yet
 
     @classmethod
     def of_predictions(cls, predict: Callable[[Ints], Bools], options: int, environments: int = 1) -> Self:
-        """Where predictions say so: state ids (n,) -> bool (n, O)."""
+        """Return terminations by ``predict``, a function from state ids (n,) to predictions bool (n, O)."""
         return cls(predict, TerminationRule(np.zeros(options, np.float32), environments))
 
     def of(self, ids: Ints) -> Bools:
-        """Whether each option's sub-goal holds: bool (n, O) for states (n,)."""
+        """Return whether each option's sub-goal holds in states ``ids`` (n,), bool (n, O)."""
         return self.rule.positive(self._all(ids))
 
     def of_running(self, ids: Ints, options: Ints) -> Bools:
-        """Whether the sub-goals of the options that run hold: bool (n,), of states (n,)."""
+        """Return whether the sub-goals of the running ``options`` (n,) hold in states ``ids`` (n,), bool (n,)."""
         return self.rule.positive(self.log_odds(ids, options), options)
 
     def log_odds(self, ids: Ints, options: Ints) -> Floats:
-        """How sure the options that run are that their sub-goals hold: float32 (n,)."""
+        """Return how sure the running ``options`` (n,) are that their sub-goals hold, float32 (n,).
+
+        ``ids`` (n,) are the states in which they run.
+        """
         if self.classify_one is None:
             return self._all(ids)[np.arange(len(ids)), options]
         self._grow(ids)
@@ -134,7 +150,7 @@ class Terminations(Resumable):
         return self.judged[ids, options]
 
     def _all(self, ids: Ints) -> Floats:
-        """Log-odds (n, O)."""
+        """Return the log-odds of all options in states ``ids`` (n,), float32 (n, O)."""
         self._grow(ids)
         judged = self.judged[ids]
         unknown = np.isnan(judged).any(axis=1)
@@ -147,7 +163,7 @@ class Terminations(Resumable):
         return self.judged[ids]
 
     def _grow(self, ids: Ints) -> None:
-        """Room for these states, twice as much as before at least."""
+        """Make room for the states ``ids``, at least twice the room there was before."""
         size = len(self.judged)
         missing = ids.max(initial=-1) + 1 - size
         if missing > 0:
@@ -159,19 +175,22 @@ RULES = {"learned": f"{__name__}:TerminationRule"}
 
 
 def load_rule(name: str) -> type[TerminationRule]:
-    """The class that the setting ``termination`` names; a ``UserError`` where it names none."""
+    """Return the class that the setting ``termination`` names. Raises ``UserError`` if there is no such class."""
     return load_class(name, "termination rule", TerminationRule, RULES)
 
 
 def saved_rule(termination: str, weights: Mapping[str, torch.Tensor], options: int) -> TerminationRule:
-    """That of an artefact with such weights."""
+    """Return the rule ``termination`` with the weights of an artefact."""
     rule = load_rule(termination)(np.zeros(options, np.float32))
     rule.load(weights)
     return rule
 
 
 def oracle_terminations(engine: Engine, columns: Sequence[int]) -> Terminations:
-    """One option for each of these sub-goals, by number, that ends where it is true; an upper bound."""
+    """Return terminations for one option per sub-goal, which ends where the sub-goal is true.
+
+    ``columns`` are the numbers of the sub-goals. Such options are an upper bound.
+    """
     return Terminations.of_predictions(lambda ids: engine.labels(ids)[:, columns], len(columns), engine.count)
 
 
@@ -182,10 +201,15 @@ def learned_terminations(
     running_only: bool = False,
     rule: str = "learned",
 ) -> Terminations:
-    """Option g*K + k ends at a positive prediction of member k of sub-goal g's ensemble, of G with K members.
+    """Return terminations of the options of G ensembles with K members each.
 
-    ``running_only``: states are classified for the running options only, which costs a K-th.
-    ``rule``: see :func:`load_rule`.
+    Option g*K + k ends at a positive prediction of member k of the ensemble of sub-goal g.
+
+    Args:
+        engine: the engine.
+        ensembles: the G ensembles.
+        running_only: whether states are classified for the running options only, which costs a K-th of the time.
+        rule: the name of the rule, see :func:`load_rule`.
     """
     stacked = StackedMembers(ensembles)
     members = len(ensembles[0])
