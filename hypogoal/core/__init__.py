@@ -1,1 +1,1 @@
-"""What every stage needs and what knows nothing of the field: errors, settings, seeds, progress, artefacts."""
+"""What every stage needs, without any knowledge of the field: errors, settings, seeds, progress, artefacts."""

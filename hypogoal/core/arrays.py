@@ -1,4 +1,4 @@
-"""Dataclasses of arrays: a row for each of n things, such as decisions, transitions, lines of a table."""
+"""Dataclasses of arrays, with a row for each of n things, such as decisions, transitions or lines of a table."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Columns(Resumable):
     @classmethod
     @cache
     def names(cls) -> tuple[str, ...]:
-        """Of the columns, in order."""
+        """Return the names of the columns, in order."""
         return tuple(field.name for field in fields(cls))
 
     @classmethod
     @cache
     def types(cls) -> dict[str, type[np.generic]]:
-        """The NumPy type that each field's annotation says."""
+        """Return the NumPy type that each field's annotation names, by the field's name."""
         hints = get_type_hints(cls)
         kinds = {}
         for name in cls.names():
@@ -50,32 +50,32 @@ class Columns(Resumable):
 
     @classmethod
     def zeros(cls, *shape: int) -> Self:
-        """So many rows of zeros, for all columns alike."""
+        """Return columns of zeros, all of shape ``shape``."""
         columns = [np.zeros(shape, dtype) for dtype in cls.types().values()]
         return cls(*columns)
 
     @classmethod
     def cast(cls, *columns: Any) -> Self:
-        """From a sequence for each column, of whatever type."""
+        """Return columns from one sequence for each column. The sequences may be of any type."""
         types = cls.types().values()
         arrays = map(np.asarray, columns, types)
         return cls(*arrays)
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The rows of all parts, one part after another."""
+        """Return the rows of all parts, one part after another."""
         each = [vars(part).values() for part in parts]
         alike = zip(*each, strict=True)
         columns = map(np.concatenate, alike)
         return cls(*columns)
 
     def at(self, rows: Any) -> Self:
-        """Some rows, by whatever NumPy takes for an index."""
+        """Return some of the rows. ``rows`` is whatever NumPy takes for an index."""
         columns = [column[rows] for column in vars(self).values()]
         return type(self)(*columns)
 
     def put(self, rows: Any, values: Self) -> None:
-        """Write other values into some rows, in place."""
+        """Write ``values`` into some of the rows, in place."""
         for name, column in vars(self).items():
             column[rows] = getattr(values, name)
 
@@ -87,7 +87,7 @@ class Columns(Resumable):
 
 
 def tensor(values: Array, device: torch.device) -> torch.Tensor:
-    """An array as a tensor on a device; on the CPU it shares the array's memory."""
+    """Return an array as a tensor on a device. On the CPU, the tensor shares the array's memory."""
     import torch
 
     return torch.from_numpy(values).to(device)

@@ -1,7 +1,8 @@
-"""The store: folders with a ``manifest.json``, and data files, each made in a hidden draft and renamed when whole.
+"""The store of outputs: folders with a ``manifest.json``, and data files.
 
-``.NAME.partial/``, the draft of ``NAME``, has ``files/`` (the future output), ``checkpoint/`` (see
-``core.checkpoints``), ``begun.json`` (what was asked for) and ``lock``, which the working process holds.
+Each output is made in a hidden draft, which is renamed when it is whole. The draft of ``NAME`` is the folder
+``.NAME.partial/``. It has ``files/`` (the future output), ``checkpoint/`` (see ``core.checkpoints``), ``begun.json``
+(what was asked for) and ``lock``, which the working process holds.
 """
 
 import contextlib
@@ -27,8 +28,8 @@ from hypogoal.core.files import reading, replace_text, sync
 MANIFEST = "manifest.json"
 LOG = "metrics.jsonl"
 SUMMARY = "summary.txt"  # what `evaluate` and `compare` print
-TO_FILL_IN = "labels.csv"  # a table that people change: the manifest does not list it
-DATA = "data"  # the kind of outputs that are HDF5 files
+TO_FILL_IN = "labels.csv"  # a table that the manifest does not list, because people change it
+DATA = "data"  # the kind of an output that is an HDF5 file
 PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
 NO_RESULT = ("workers",)  # settings that change no result
 AGAIN = "Make the artefact again."
@@ -39,7 +40,7 @@ PACKAGES = (
 
 
 class Input(BaseModel):
-    """What an artefact was made from: an artefact or a file, and its :func:`sha256_of`."""
+    """What an artefact was made from: an artefact or a file, with its :func:`sha256_of`."""
 
     kind: str
     path: str  # as it was given
@@ -48,7 +49,7 @@ class Input(BaseModel):
 
 
 class Manifest(BaseModel):
-    """What made an artefact, and what it holds."""
+    """A record of what made an artefact, and of what the artefact holds."""
 
     kind: str
     format: Literal[3] = 3
@@ -58,28 +59,28 @@ class Manifest(BaseModel):
     files: dict[str, str] = {}  # path within the folder -> sha256
     versions: dict[str, str] = {}
     command: list[str] = []
-    took: dict[str, Any] = {}  # seconds, in which alone two runs of a command differ
+    took: dict[str, Any] = {}  # seconds, which is all in which two runs of a command differ
 
     def text(self, *left_out: str) -> str:
-        """As JSON, without some fields."""
+        """Return the manifest as JSON, without the fields ``left_out``."""
         content = self.model_dump(exclude={*left_out})
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
 class Settings(dict[str, Any]):
-    """A manifest's configuration; a missing key is a ``UserError``."""
+    """The configuration in a manifest. Looking up a missing key raises ``UserError``."""
 
     def __missing__(self, key: str) -> Any:
         raise UserError("the manifest's configuration lacks a setting", key, AGAIN)
 
 
 class Artefact:
-    """A complete artefact: its folder and its manifest, which is read and checked; its files are not.
+    """A complete artefact: its folder and its manifest. The manifest is read and checked, the other files are not.
 
     Attributes:
         kind: ensemble, options, meta, baseline, evaluation, report, comparison, audit, recorded-audit, hub, episodes.
-        config: the resolved configuration that made it.
-        seed: the seed that made it.
+        config: the resolved configuration that made the artefact.
+        seed: the seed that made the artefact.
     """
 
     def __init__(self, path: Path):
@@ -94,7 +95,10 @@ class Artefact:
         self.seed = self.manifest.seed
 
     def input(self, kind: str) -> Path:
-        """The input of a kind; a ``UserError`` if there is none, or it is missing or was changed."""
+        """Return the path of the input of kind ``kind``.
+
+        Raises ``UserError`` if there is no such input, or if it is missing or was changed.
+        """
         for entry in self.manifest.inputs:
             if entry.kind == kind:
                 place = self.place_of(entry)
@@ -104,13 +108,16 @@ class Artefact:
         raise UserError(f"{self.path} was not made from any {kind}", self.path / MANIFEST, "Is it the right artefact?")
 
     def place_of(self, entry: Input) -> Path:
-        """Where an input lies: at its relative path or, if nothing is there, at its recorded one."""
+        """Return the path of an input: its relative path or, if nothing is there, its recorded path."""
         relative, recorded = self.path / entry.relative, Path(entry.path)
         moved_alone = recorded.exists() and not relative.exists()
         return (recorded if moved_alone else relative).resolve()
 
     def faults(self, within: Path | None = None) -> list[str]:
-        """A line for each file and each input that is missing or changed; with ``within`` only of inputs in there."""
+        """Return a line for each file and each input that is missing or changed.
+
+        With ``within``, only inputs in that folder are checked.
+        """
         checks = [(name, self.path / name, digest) for name, digest in self.manifest.files.items()]
         for entry in self.manifest.inputs:
             place = self.place_of(entry)
@@ -124,7 +131,7 @@ class Artefact:
 
 
 def _fault(path: Path, digest: str) -> str:
-    """What is wrong with a file or an artefact that had this sha256; empty if nothing is."""
+    """Return what is wrong with a file or an artefact whose sha256 was ``digest``. The text is empty if nothing is."""
     if not path.exists():
         return "missing"
     try:
@@ -140,9 +147,10 @@ def _read_manifest(path: Path, do: str) -> Manifest:
 
 
 def open_artefact(path: Path, *kinds: str) -> Artefact:
-    """A complete artefact of one of these kinds, or of any, whose files are as they were written; else a ``UserError``.
+    """Return the complete artefact in the folder ``path``, after a check of its files, which takes some ms per MB.
 
-    Takes some ms per MB.
+    Raises ``UserError`` if there is no artefact, if it is none of ``kinds``, or if its files are not as they were
+    written. Without ``kinds``, an artefact of any kind is returned.
     """
     artefact = Artefact(path)
     if kinds and artefact.kind not in kinds:
@@ -154,7 +162,10 @@ def open_artefact(path: Path, *kinds: str) -> Artefact:
 
 
 def sha256_of(path: Path) -> str:
-    """The sha256 of a file; of an artefact that of what its manifest says, without white space and ``took``."""
+    """Return the sha256 of a file, or of an artefact's manifest.
+
+    For an artefact's folder, the sha256 is that of what the manifest says, without white space and without ``took``.
+    """
     if path.is_dir():
         text = Artefact(path).manifest.text("took")
         return hashlib.sha256(text.encode()).hexdigest()
@@ -163,7 +174,7 @@ def sha256_of(path: Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that determine an artefact's numbers."""
+    """Return the versions of Python and of the packages that determine an artefact's numbers, by name."""
     installed = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -172,10 +183,10 @@ def versions() -> dict[str, str]:
 
 
 class Draft:
-    """An output in the making; :func:`create` gives one to fill.
+    """An output in the making, which :func:`create` gives to be filled.
 
     Attributes:
-        files: the folder to fill; of a data file the folder in which to write it under the output's name.
+        files: the folder to fill. A data file is written into this folder under the output's name.
     """
 
     def __init__(self, out: Path):
@@ -187,17 +198,17 @@ class Draft:
         self.lock = self.folder / "lock"
 
     def checkpoints(self, name: str = "stage") -> Checkpoints:
-        """The checkpoints of this name."""
+        """Return the checkpoints named ``name``."""
         return Checkpoints(self.checkpoint / f"{name}.safetensors")
 
     @property
     def is_resumable(self) -> bool:
-        """Whether there is a checkpoint to continue from."""
+        """Whether there is a checkpoint from which to continue."""
         return self.begun.is_file() and any(self.checkpoint.glob("*.safetensors"))
 
     @property
     def is_locked(self) -> bool:
-        """Whether a process works on it."""
+        """Whether a process is working on the draft."""
         try:
             with self.lock.open("r+b") as file:
                 return not lock_descriptor(file.fileno(), blocking=False)
@@ -206,9 +217,9 @@ class Draft:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the lock; a ``UserError`` if another process does.
+        """Hold the lock within the block. Raises ``UserError`` if another process holds the lock.
 
-        At the end a draft is removed that has neither a checkpoint nor a finished output.
+        At the end of the block, the draft is removed if it has neither a checkpoint nor a finished output.
         """
         lock = FileLock(self.lock, timeout=PATIENCE_SECONDS)
         is_new = not self.folder.exists()
@@ -230,7 +241,7 @@ class Draft:
         finally:
             if not self.is_resumable and not (self.files / MANIFEST).is_file():
                 self._clear()
-                shutil.rmtree(self.folder, ignore_errors=True)  # the lock last
+                shutil.rmtree(self.folder, ignore_errors=True)  # after all else, because the lock is in it
             lock.release()
 
     def begin(self, wanted: Manifest) -> None:
@@ -240,7 +251,7 @@ class Draft:
         replace_text(self.begun, wanted.text())
 
     def _clear(self) -> None:
-        self.begun.unlink(missing_ok=True)  # first: what is left then is not resumed
+        self.begun.unlink(missing_ok=True)  # first, because a draft without this file is never resumed
         for folder in (self.checkpoint, self.files):
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -256,17 +267,27 @@ def create(
     force: bool = False,
     resume: bool = False,
 ) -> Iterator[Draft]:
-    """A draft to fill; when the block ends, its manifest is written and it takes its place at ``out``.
+    """Give a draft to fill. When the block ends, write the draft's manifest and move the draft to ``out``.
 
-    ``config`` determines the output, beside ``seed``, ``inputs`` (artefacts and files) and versions; keys added in the
-    block are in the manifest. Of the kind ``DATA`` the output is the one file in ``draft.files``, without a manifest.
-    If the block raises, ``out`` stays as it was, and the draft stays if it has a checkpoint.
+    If the block raises, ``out`` stays as it was, and the draft stays if it has a checkpoint. An output of kind ``DATA``
+    is the one file in ``draft.files``, without a manifest.
+
+    Args:
+        out: the path of the output.
+        kind: the kind of the output.
+        config: what determines the output, beside ``seed``, ``inputs`` and versions. Keys that are added in the block
+            are in the manifest.
+        seed: the seed of the output.
+        inputs: the artefacts and files from which the output is made.
+        force: whether an existing output or draft is replaced.
+        resume: whether an unfinished draft is continued.
 
     Raises:
-        UserError: ``out`` exists and ``force`` is not given, is of another kind or none of hypogoal's, would replace an
-            input, or is being written by another process; or its draft has a checkpoint and neither ``force`` nor
-            ``resume`` is given, or was begun with other settings, seed, inputs or versions.
-        Complete: with ``resume``, the output is complete and was made with these.
+        UserError: if ``out`` exists and ``force`` is not given, is of another kind or none of hypogoal's, would replace
+            an input, or is being written by another process. Also if the draft of ``out`` has a checkpoint and neither
+            ``force`` nor ``resume`` is given, or if the draft was begun with other settings, seed, inputs or versions.
+        Complete: if ``resume`` is given, and the output is complete and was made with the settings, seed and inputs
+            given.
     """
     started = time.monotonic()
     draft = Draft(out)
@@ -279,7 +300,7 @@ def create(
         command=_command(),
     )
     with draft.locked():
-        _put_in_place(draft)  # a process was killed while it did
+        _put_in_place(draft)  # in case that a process was killed while it put the output in place
         if not _continues(draft, wanted, force=force, resume=resume):
             draft.begin(wanted)
         try:
@@ -288,14 +309,14 @@ def create(
             wanted.took = {"seconds": round(time.monotonic() - started, 1)}
             _finish(draft, wanted)
         except BaseException as error:
-            is_useless = isinstance(error, UserError) and error.do == ANEW  # what the draft has cannot be continued
+            is_useless = isinstance(error, UserError) and error.do == ANEW  # the draft cannot be continued
             if draft.is_resumable and not is_useless:
                 error.add_note("the last checkpoint is kept: give the same command with --resume to continue")
             raise
 
 
 def _command() -> list[str]:
-    """The command of this process, without ``--resume``, which changes no result."""
+    """Return the command of this process, without ``--resume``, which changes no result."""
     program = Path(sys.argv[0]).name
     words = ["hypogoal" if program == "__main__.py" else program, *sys.argv[1:]]
     return [word for word in words if word != "--resume"]
@@ -310,7 +331,10 @@ def _input(path: Path, out: Path) -> Input:
 
 
 def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> bool:
-    """Whether the draft is continued, rather than begun anew. May I write here? If not, a ``UserError``."""
+    """Return whether the draft is continued rather than begun anew.
+
+    Raises ``UserError`` if ``out`` may not be written.
+    """
     out, kind = draft.out, kind_of(draft.out)
     if kind not in (None, wanted.kind):
         do = "Move it away, or choose another --out."
@@ -323,8 +347,8 @@ def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> 
         raise UserError("an unfinished output exists", out, "Give --resume to continue it, or --force to begin anew.")
     if kind and resume:
         if kind != DATA:
-            open_artefact(out)  # refuses changed files
-        complete = _manifest_of(out).model_copy(update={"versions": {}})  # nothing is continued with others
+            open_artefact(out)  # raises UserError if files were changed
+        complete = _manifest_of(out).model_copy(update={"versions": {}})  # versions do not matter for a complete output
         _refuse_other(complete, wanted, "the complete output was made")
         raise Complete(f"{out} is complete already")
     if kind and not force:
@@ -333,7 +357,7 @@ def _continues(draft: Draft, wanted: Manifest, *, force: bool, resume: bool) -> 
 
 
 def _refuse_other(before: Manifest, now: Manifest, subject: str) -> None:
-    """Refuse (``UserError``) what differs in a setting that both have, in seed, inputs or versions."""
+    """Raise ``UserError`` if the manifests differ in a setting that both have, in seed, inputs or versions."""
     old, new = _identity(before), _identity(now)
     for key, value in old.items():
         if key in new and json.dumps(value) != json.dumps(new[key]):
@@ -342,14 +366,14 @@ def _refuse_other(before: Manifest, now: Manifest, subject: str) -> None:
 
 
 def _identity(manifest: Manifest) -> dict[str, Any]:
-    """All that determines an output, by name."""
+    """Return everything that determines an output, by name."""
     inputs = [entry.sha256 for entry in manifest.inputs]
     identity = {"seed": manifest.seed, "inputs": inputs, **manifest.versions, **manifest.config}
     return {key: value for key, value in identity.items() if key not in NO_RESULT}
 
 
 def _manifest_of(out: Path) -> Manifest:
-    """What made an output: a folder or an HDF5 file."""
+    """Return the manifest of an output, which is a folder or an HDF5 file."""
     if out.is_dir():
         return Artefact(out).manifest
     import h5py
@@ -362,7 +386,10 @@ def _manifest_of(out: Path) -> Manifest:
 
 
 def kind_of(out: Path) -> str | None:
-    """The kind of an output; empty if it is damaged or none of hypogoal's, None if nothing is there."""
+    """Return the kind of an output.
+
+    The kind is empty if the output is damaged or none of hypogoal's. It is None if nothing is there.
+    """
     if not out.exists() or (out.is_dir() and not os.listdir(out)):
         return None
     try:
@@ -372,7 +399,7 @@ def kind_of(out: Path) -> str | None:
 
 
 def _finish(draft: Draft, manifest: Manifest) -> None:
-    """Write the manifest of what is in the draft, and put it in place."""
+    """Write the manifest of what is in the draft, and put the output in place."""
     files = [path for path in sorted(draft.files.rglob("*")) if path.is_file() and path.name != TO_FILL_IN]
     for path in files:
         sync(path)
@@ -388,7 +415,7 @@ def _finish(draft: Draft, manifest: Manifest) -> None:
 
 
 def _put_in_place(draft: Draft) -> None:
-    """Rename a finished folder to the output; what was there is moved aside first and removed last."""
+    """Rename a finished folder to the output. What was there before is moved aside first and removed last."""
     old = draft.folder / "old"
     if (draft.files / MANIFEST).is_file():
         shutil.rmtree(draft.checkpoint, ignore_errors=True)

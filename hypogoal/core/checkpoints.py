@@ -1,7 +1,8 @@
-"""Checkpoints: all that a stage needs to resume, saved while it works.
+"""Checkpoints: all that a stage needs to resume, saved while the stage works.
 
-A state is nested dicts and lists of arrays, tensors and plain JSON values; objects give it as ``snapshot()`` and take
-it back with ``restore(snapshot)``. One state is one safetensors file with its JSON part as bytes; no pickle.
+A state is nested dicts and lists of arrays, tensors and plain JSON values. Objects return their state by ``snapshot()``
+and continue from a state by ``restore(snapshot)``. One state is one safetensors file, with the JSON part of the state
+as bytes. No pickle is used.
 """
 
 import copy
@@ -22,19 +23,21 @@ from hypogoal.core.files import reading, replacing
 
 State = dict[str, Any]
 
-FEWEST_SECONDS = 10.0  # between two checkpoints
-WAIT_PER_COST = 3.0  # times that, for each second that saving takes: at most 3 % of a run
-PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # in the environment, in place of the former, for tests
+FEWEST_SECONDS = 10.0  # the shortest time between two checkpoints
+# For each second that saving takes, the time between checkpoints is this many times FEWEST_SECONDS. So saving takes at
+# most 3 % of a run.
+WAIT_PER_COST = 3.0
+PACE = "HYPOGOAL_CHECKPOINT_SECONDS"  # an environment variable that replaces FEWEST_SECONDS, for tests
 JSON_PART = "json"
 ARRAY, TENSOR = "$array", "$tensor"
 ANEW = "Give --force and no --resume to begin anew."
-FORMAT = 2  # of what a state holds: raised where a version cannot go on with the states of those before
+FORMAT = 2  # the format of a state, raised in a version that cannot go on with the states of earlier versions
 
 
 class Checkpoints:
-    """One state on disk, replaced from time to time; the old file stays until the new one is whole.
+    """One state on disk, which is replaced from time to time. The old file stays until the new file is whole.
 
-    With ``path`` None nothing is ever saved.
+    If ``path`` is None, nothing is ever saved.
     """
 
     def __init__(self, path: Path | None):
@@ -43,7 +46,7 @@ class Checkpoints:
         self._next = time.monotonic() + self._fewest
 
     def offer(self, state: Callable[[], State]) -> None:
-        """Save ``state()`` if it is due."""
+        """Save ``state()`` if a checkpoint is due."""
         begun = time.monotonic()
         if self.path is None or begun < self._next:
             return
@@ -52,9 +55,9 @@ class Checkpoints:
         self._next = now + self._fewest * max(1.0, WAIT_PER_COST * (now - begun))
 
     def save(self, state: State) -> None:
-        """Write ``state``. If that fails, a ``UserError``; the previous checkpoint stays.
+        """Write ``state``. Raises ``UserError`` if that fails, and then the previous checkpoint stays.
 
-        A state with NaN or Inf in a tensor is not written: the last good one stays.
+        A state with NaN or Inf in a tensor is not written, so that the last good state stays.
         """
         from safetensors import SafetensorError
         from safetensors.numpy import save_file
@@ -76,7 +79,10 @@ class Checkpoints:
             raise UserError(fault, self.path, "Free some disk space, then continue with --resume.") from None
 
     def load(self) -> State | None:
-        """The saved state, or None. A damaged file, or another version's, is a ``UserError``."""
+        """Return the saved state, or None if there is none.
+
+        Raises ``UserError`` if the file is damaged or of another version.
+        """
         from safetensors.numpy import load_file
 
         if self.path is None or not self.path.is_file():
@@ -91,13 +97,13 @@ class Checkpoints:
 
 
 def _without_array(arrays: dict[str, NDArray[Any]], value: Any) -> Any:
-    """What JSON has in place of a value that it cannot hold; an array or tensor goes into ``arrays``."""
+    """Return what JSON has in place of ``value``, which JSON cannot hold. An array or tensor is put into ``arrays``."""
     if isinstance(value, np.generic):
         return value.item()
     kind, array = ARRAY, value
     if hasattr(value, "detach"):
         kind, tensor = TENSOR, value.detach().cpu()
-        if str(tensor.dtype) == "torch.bfloat16":  # which NumPy lacks; float32 has all of its values
+        if str(tensor.dtype) == "torch.bfloat16":  # NumPy lacks the type, and float32 has all of its values
             tensor = tensor.float()
         array = tensor.numpy()
         if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -118,34 +124,38 @@ def _with_array(arrays: Mapping[str, NDArray[Any]], part: State) -> Any:
 
 
 class Resumable:
-    """An object that continues after a break as if there had been none, from a snapshot of what changes.
+    """An object that continues after a break as if there had been no break, from a snapshot of what changes.
 
     Attributes:
-        CHANGING: the names of the attributes that change. Each is a network, an optimiser, a random generator, a
-            tensor, a deque, itself resumable, a list of such, or of arrays, numbers, lists, dicts by name and None.
+        CHANGING: the names of the attributes that change. Such an attribute is a network, an optimiser, a random
+            generator, a tensor, a deque, a ``Resumable``, or a list of any of them. It may also be made of arrays,
+            numbers, lists, dicts by name and None.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ()
 
     def snapshot(self) -> State:
-        """All that a resumed run needs to continue exactly; valid until the next step."""
+        """Return all that a resumed run needs to continue exactly. The snapshot is valid until the next step."""
         return {name: snapshot_of(getattr(self, name)) for name in self.CHANGING}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an object made with the same arguments."""
+        """Continue from a ``snapshot`` of an object that was made with the same arguments."""
         for name in self.CHANGING:
             setattr(self, name, restored(getattr(self, name), snapshot[name]))
 
 
 def snapshot_of(value: Any) -> Any:
-    """What :func:`restored` needs; of an optimiser its moments and step counts, since settings are configured."""
+    """Return what :func:`restored` needs of ``value``.
+
+    Of an optimiser, that is its moments and step counts only, because its settings are configured.
+    """
     if isinstance(value, Resumable):
         return value.snapshot()
     if isinstance(value, list | deque):
         return [snapshot_of(item) for item in value]
     if isinstance(value, np.random.Generator):
         return value.bit_generator.state
-    if hasattr(value, "set_state"):  # torch's generator
+    if hasattr(value, "set_state"):  # a random generator of torch
         return value.get_state()
     if hasattr(value, "param_groups"):  # an optimiser
         return value.state_dict()["state"]
@@ -153,7 +163,7 @@ def snapshot_of(value: Any) -> Any:
 
 
 def restored(value: Any, saved: Any) -> Any:
-    """``value`` with the saved contents, changed in place where other objects share it."""
+    """Return ``value`` with the saved contents. It is changed in place if other objects may share it."""
     if isinstance(value, Resumable):
         value.restore(saved)
     elif isinstance(value, deque):

@@ -1,8 +1,8 @@
-"""Settings: a pydantic model for each stage, whose fields have default, meaning, unit, source and limits.
+"""Settings: a pydantic model for each stage, whose fields have a default, a meaning, a unit, a source and limits.
 
-Precedence: ``--set`` > option > preset > the domain's default > default. The settings that only one learner or chooser
-has are a model of their own, a field of the stage's model, see :func:`part`. Their names are flat all the same: on the
-command line, in presets, in manifests.
+Precedence: ``--set`` > option > preset > the domain's default > default. Settings that only one learner or chooser has
+are in a model of their own, which is a field of the stage's model, see :func:`part`. The names of such settings are
+flat all the same: on the command line, in presets, in manifests.
 """
 
 import difflib
@@ -31,10 +31,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 
 C = TypeVar("C", bound="Config")
-Values = Mapping[str, Any]  # of settings, by name
-DOMAIN = "doorkey"  # its presets and defaults hold if no domain is named
+Values = Mapping[str, Any]  # values of settings, by name
+DOMAIN = "doorkey"  # the domain whose presets and defaults hold if no domain is named
 PRESETS = Path(__file__).parents[1] / "presets"
-MODELS = {  # by stage; collect's are its domain's, those of run its experiment's
+MODELS = {  # by stage, except collect, whose model is its domain's, and run, whose model is its experiment's
     "train-ensemble": "hypogoal.hypotheses.config:TrainEnsembleConfig",
     "train-options": "hypogoal.meta.config:TrainOptionsConfig",
     "train-meta": "hypogoal.meta.config:TrainMetaConfig",
@@ -42,23 +42,26 @@ MODELS = {  # by stage; collect's are its domain's, those of run its experiment'
     "audit": "hypogoal.meta.config:AuditConfig",
 }
 STAGES = ("collect", *MODELS)
-TABLES = (*STAGES, "run")  # of presets
-OWN = "module:object"  # any name of one's own, among choices and parts
-MOST = 10_000  # integers that one range may stand for
+TABLES = (*STAGES, "run")  # the tables that a preset may have
+OWN = "module:object"  # stands for any name of a user's own code, among choices and parts
+MOST = 10_000  # the largest number of integers that one range may stand for
 
 
 class Config(BaseModel):
-    """The settings of a stage or of a part of it; names that it lacks and values that it does not allow are refused."""
+    """The settings of a stage or of a part of it. Unknown names and values that are not allowed are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @classmethod
     def of(cls, **values: Any) -> Self:
-        """The settings with these values, of the parts that they choose; those of other parts have no effect."""
+        """Return the settings with these values, and with the parts that the values choose.
+
+        Values of parts that are not chosen have no effect.
+        """
         return resolve(cls, values, {}, stage=cls.__name__)
 
     def part(self, kind: type[C]) -> C:
-        """The part of this kind; a ``TypeError`` where the settings have chosen none."""
+        """Return the part that is a ``kind``. Raises ``TypeError`` if the settings have chosen no such part."""
         for name in parts_of(type(self)):
             chosen = getattr(self, name)
             if isinstance(chosen, kind):
@@ -66,7 +69,7 @@ class Config(BaseModel):
         raise TypeError(f"these settings have no {kind.__name__}")
 
     def flat(self) -> dict[str, Any]:
-        """All settings by name, those of parts too, as JSON has them."""
+        """Return all settings by name, also those of parts, as JSON has them."""
         parts = parts_of(type(self))
         values = self.model_dump(mode="json", exclude={*parts})
         for name in parts:
@@ -89,9 +92,10 @@ class Config(BaseModel):
 
 @dataclass(frozen=True)
 class Details:
-    """What is said of a setting, and which values it, or each item of a tuple, may have.
+    """What is said of a setting, and which values are allowed.
 
-    It is ``low`` to ``high`` or one of ``words``, or among ``choices``; ``own``: or ``module:object``.
+    If there are ``choices``, the value must be among them, or be a ``module:object`` if ``own`` is true. Otherwise the
+    value must be within ``low`` to ``high``, or be one of ``words``. For a tuple, each item must be allowed.
     """
 
     unit: str = ""
@@ -103,7 +107,7 @@ class Details:
     own: bool = False
 
     def allow(self, value: Any) -> bool:
-        """Whether the setting may have this value."""
+        """Return whether the setting may have this value."""
         if self.choices:
             return value in self.choices or (self.own and ":" in value)
         if value in self.words:
@@ -116,7 +120,10 @@ class Details:
         return self.low > -inf or self.high < inf
 
     def __str__(self) -> str:
-        """The values allowed, in a few words; empty if all of the setting's type."""
+        """Return the allowed values in a few words.
+
+        The text is empty if all values of the setting's type are allowed.
+        """
         if self.choices:
             choices = [str(choice) for choice in self.choices]
             if self.own:
@@ -128,48 +135,60 @@ class Details:
 
 @dataclass(frozen=True)
 class Choice:
-    """What a part is, by the value of a setting: the model of those that this value brings.
+    """The model of a part, by the value of a setting.
 
-    Values of one's own, ``OWN``, bring those of all.
+    ``by`` is the name of the setting, and ``models`` has the model that each of its values brings. A value that names a
+    user's own code brings the model ``OWN``, which has the settings of all models.
     """
 
     by: str
     models: Mapping[str, type[Config]]
 
     def model(self, value: str) -> type[Config] | None:
-        """The model that a value brings."""
+        """Return the model that a value brings, or None if it brings none."""
         return self.models.get(OWN if ":" in value else value)
 
     @property
     def whole(self) -> type[Config]:
-        """The model of all."""
+        """The model that has the settings of all models."""
         return self.models[OWN]
 
 
 def part(by: str, models: Mapping[str, type[Config]]) -> Any:
-    """A field of a ``Config`` that is a part, see :class:`Choice`; None where the setting's value brings none."""
+    """Return a field of a ``Config`` that is a part, see :class:`Choice`.
+
+    The field is None if the value of the setting ``by`` brings no model.
+    """
     return Field(None, json_schema_extra={"part": Choice(by, models)})  # type: ignore[dict-item]
 
 
 @cache
 def parts_of(model: type[Config]) -> dict[str, Choice]:
-    """The fields of a model that are parts."""
+    """Return the fields of a model that are parts, by name."""
     extras: dict[str, Any] = {name: field.json_schema_extra or {} for name, field in model.model_fields.items()}
     return {name: extra["part"] for name, extra in extras.items() if "part" in extra}
 
 
 def setting(default: Any, meaning: str, **details: Any) -> Any:
-    """A field of a ``Config`` with its meaning, and its :class:`Details`: unit, source, limits."""
+    """Return a field of a ``Config``: a setting with its default, its meaning, and its unit, source and limits.
+
+    ``details`` are the fields of :class:`Details`. ``unit`` and ``source`` are texts. ``low`` and ``high`` are the
+    limits of a number, ``words`` are texts that are allowed beside numbers, and ``choices`` are all values that are
+    allowed. With ``own``, a ``module:object`` is allowed, too.
+    """
     return Field(default, description=meaning, json_schema_extra={"details": Details(**details)})  # type: ignore[dict-item]
 
 
 def model_of(stage: str) -> type[Config]:
-    """The model of the settings of one of ``MODELS``."""
+    """Return the model of the settings of a stage, one of ``MODELS``."""
     return resolve_name(MODELS[stage])
 
 
 def assigned(assignments: Iterable[str]) -> dict[str, str]:
-    """``["steps=300", ...]`` -> ``{"steps": "300", ...}``."""
+    """Parse texts: ``["steps=300", ...]`` becomes ``{"steps": "300", ...}``.
+
+    Raises ``UserError`` if a text is not ``key=value``.
+    """
     values = {}
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
@@ -180,7 +199,7 @@ def assigned(assignments: Iterable[str]) -> dict[str, str]:
 
 
 def integers(text: str) -> list[int]:
-    """``0-3,7`` -> ``[0, 1, 2, 3, 7]``; anything else is a ``UserError``."""
+    """Parse integers: ``0-3,7`` becomes ``[0, 1, 2, 3, 7]``. Raises ``UserError`` for anything else."""
     try:
         return _items(text, int)
     except ValueError:
@@ -188,7 +207,12 @@ def integers(text: str) -> list[int]:
 
 
 def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]:
-    """The table ``[stage]`` of a preset: one of the package, for ``domain`` or else for DoorKey, or a TOML file."""
+    """Return the table ``[stage]`` of the preset ``name``, which is empty if there is no such table.
+
+    ``name`` is a preset of the package or a TOML file. Presets of the package are those of ``domain``, or of DoorKey if
+    the domain has none. Raises ``UserError`` if there is no such preset, or if it has a table of another name than a
+    stage's.
+    """
     if name is None:
         return {}
     folder = PRESETS / domain
@@ -209,11 +233,11 @@ def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]
 
 
 def resolve(model: type[C], *layers: Values, stage: str) -> C:
-    """The settings of ``stage``, of the model and of the parts that its settings choose; later layers win.
+    """Return the settings of ``stage``: the model, and the parts that its settings choose. Later layers win.
 
-    None stands for a value that is not given. The last layer is what the user typed: there a setting of a part that is
-    not chosen is refused; the others, a domain's defaults and a preset, may have some, without effect. What is refused
-    is a ``UserError``.
+    None stands for a value that is not given. The last layer is what the user typed. In the last layer, a setting of a
+    part that is not chosen is refused. The other layers, a domain's defaults and a preset, may have such settings,
+    without effect. Raises ``UserError`` for what is refused.
     """
     values: dict[str, Any] = {}
     for layer in layers:
@@ -233,7 +257,10 @@ def resolve(model: type[C], *layers: Values, stage: str) -> C:
 
 
 def _validated(kind: type[C], values: Values, model: type[Config], stage: str) -> C:
-    """Settings of this kind, ``model`` itself or a part of it."""
+    """Return settings of this kind, which is ``model`` itself or a part of it.
+
+    Raises ``UserError`` if a value is not allowed.
+    """
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -241,12 +268,12 @@ def _validated(kind: type[C], values: Values, model: type[Config], stage: str) -
 
 
 def homes_of(model: type[Config]) -> list[type[Config]]:
-    """The model, then those of all its parts."""
+    """Return the model, followed by the models of all its parts."""
     return [model, *(choice.whole for choice in parts_of(model).values())]
 
 
 def names_of(model: type[Config]) -> list[str]:
-    """All settings of the model and of its parts."""
+    """Return the names of all settings of the model and of its parts."""
     names: list[str] = []
     for home in homes_of(model):
         names += home.model_fields
@@ -254,12 +281,18 @@ def names_of(model: type[Config]) -> list[str]:
 
 
 def known(model: type[Config], values: Values) -> dict[str, Any]:
-    """The values of a manifest or data file that the model or a part of it has: earlier versions had others, too."""
+    """Return the values of a manifest or data file whose names the model or a part of it has.
+
+    Files of earlier versions may have other names, which are left out.
+    """
     return {name: values[name] for name in names_of(model) if name in values}
 
 
 def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str, Any]]:
-    """Every setting of the model, then of its parts; a layer has values that replace defaults, and their source."""
+    """Return a description of every setting of the model, then of its parts.
+
+    A layer has values that replace defaults, and the source of these values.
+    """
     replacing: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for values, source in layers:
@@ -289,7 +322,7 @@ def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str
 
 
 def as_toml(stage: str, rows: Iterable[Values]) -> str:
-    """Settings as :func:`described` has them, as a preset to edit."""
+    """Return settings, as :func:`described` gives them, as the text of a preset that the user can edit."""
     lines = [f"[{stage}]"]
     for row in rows:
         value = json.dumps(row["default"], ensure_ascii=False)
@@ -298,7 +331,11 @@ def as_toml(stage: str, rows: Iterable[Values]) -> str:
 
 
 def _typed(raw: Any, kind: Any) -> Any:
-    """What was typed, as pydantic takes it: the items of a tuple; ``3e5`` for an integer; True is no number."""
+    """Return what the user typed in a form that pydantic takes.
+
+    A tuple becomes a list of its items. ``3e5`` becomes a number if an integer is needed. True and False are refused
+    where a number is needed.
+    """
     if get_origin(kind) is tuple:
         kind, *_ = get_args(kind)
         items = _items(raw, kind) if isinstance(raw, str) else raw
@@ -314,7 +351,7 @@ def _typed(raw: Any, kind: Any) -> Any:
 
 
 def _items(text: str, kind: Any) -> list[Any]:
-    """The items between commas; of integers also ``3-7``."""
+    """Return the items between commas. Integers can also be given as a range, ``3-7``."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
     if kind is not int:
         return parts
@@ -330,7 +367,7 @@ def _items(text: str, kind: Any) -> list[Any]:
 
 
 def _type_text(kind: Any) -> str:
-    """A setting's type: ``float``, ``tuple[int, ...]``, ``float|auto``."""
+    """Return a setting's type as a text: ``float``, ``tuple[int, ...]``, ``float|auto``."""
     if get_origin(kind) is not Union:
         return getattr(kind, "__name__", str(kind))
     number, words = get_args(kind)
@@ -343,7 +380,10 @@ def _details(field: FieldInfo) -> Details:
 
 
 def _refusal(kind: type[Config], model: type[Config], error: ValidationError, stage: str) -> UserError:
-    """What is said of the first fault in settings of this kind, ``model`` itself or a part of it."""
+    """Return the error that describes the first fault in settings of this kind.
+
+    The kind is ``model`` itself or a part of it.
+    """
     fault = error.errors()[0]
     name = str(fault["loc"][0])
     advice = f"See 'hypogoal config {stage}'."

@@ -1,4 +1,4 @@
-"""Random numbers for modules of torch, which ask for no generator when they draw their first weights."""
+"""Random numbers for torch's modules, which ask for no generator when they draw their first weights."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,9 +13,10 @@ DRAWING = {*IN_PLACE, *NEW}
 
 
 class DrawsFrom(TorchFunctionMode):
-    """A context: what would be drawn from torch's generator, which all threads share, comes from this one.
+    """A context in which draws from torch's generator, which all threads share, come from ``generator`` instead.
 
-    The numbers are those of torch's generator in the same state. Only this thread's draws are meant.
+    The numbers are those that torch's generator would give in the same state. Only draws of the present thread are
+    affected.
     """
 
     def __init__(self, generator: torch.Generator):

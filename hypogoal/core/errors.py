@@ -1,4 +1,4 @@
-"""Errors for users: one line that says what is wrong, where and what to do."""
+"""Errors for users: each is one line that says what is wrong, where it is wrong, and what to do."""
 
 from typing import Any
 
@@ -23,22 +23,25 @@ class UserError(Exception):
 
 
 class Complete(Exception):
-    """No error: the output to resume is complete and as requested. The command line says so and exits with code 0."""
+    """A signal that the output to resume is complete and as requested, which is no error.
+
+    The command line prints the message and exits with code 0.
+    """
 
 
 class NumericalError(Exception):
-    """NaN or Inf in training: names the member and the step; nothing was overwritten."""
+    """NaN or Inf in training. The message names the member and the step, and nothing was overwritten."""
 
 
 def printable(text: str) -> str:
-    """A text as one line without control, invisible and bidirectional characters, which are shown as ``?``."""
+    """Return a text as one line. Control, invisible and bidirectional characters are shown as ``?``."""
     line = " ".join(text.split())
     signs = [sign if sign.isprintable() else "?" for sign in line]
     return "".join(signs)
 
 
 def reason(error: Any) -> str:
-    """What is wrong, in one line; of a pydantic ``ValidationError`` the first fault and its place."""
+    """Return what is wrong, in one line. For a pydantic ``ValidationError``, that is the first fault and its place."""
     if not hasattr(error, "errors"):
         return str(error)
     fault = error.errors()[0]

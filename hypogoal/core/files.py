@@ -1,6 +1,7 @@
-"""Small files. What cannot be read is a ``UserError``; what is written has its name once it is whole and on the disk.
+"""Reading and writing of small files.
 
-``subject`` begins a message ("the weights"); ``do`` is what to do.
+If a file cannot be read, a ``UserError`` is raised. A file that is written gets its name once it is whole and on the
+disk. ``subject`` begins a message ("the weights"), and ``do`` says what to do.
 """
 
 import contextlib
@@ -15,14 +16,17 @@ from pydantic_core import to_json
 
 from hypogoal.core.errors import UserError, reason
 
-NO_FILE_NAME = '<>:"|?*'  # not allowed in file names on Windows
-POINTER = b"version https://git-lfs"  # how a file begins that Git LFS has not fetched
+NO_FILE_NAME = '<>:"|?*'  # signs that are not allowed in file names on Windows
+POINTER = b"version https://git-lfs"  # the beginning of a file that Git LFS has not fetched
 AGAIN = "Write or download it again; hypogoal's page on data of your own says what is read."
 
 
 @contextlib.contextmanager
 def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None]:
-    """A block that reads a file by some library: whatever that raises becomes one line with the cause."""
+    """Turn what a library raises within the block, while it reads ``path``, into a ``UserError``.
+
+    The error is one line with the cause.
+    """
     try:
         yield
     except (UserError, MemoryError, UnicodeEncodeError):
@@ -51,7 +55,10 @@ def reading(path: Path, do: str = AGAIN, subject: str = "this") -> Iterator[None
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The rows of a log that may still be growing, but for a half-written one; none if it cannot be read."""
+    """Return the rows of a log that may still be growing, without a half-written row.
+
+    The list is empty if the log cannot be read.
+    """
     rows = []
     with contextlib.suppress(OSError, ValueError):
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -60,16 +67,17 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file: a reader sees the old contents or ``text``."""
+    """Write ``text`` to a file. A reader sees the old contents or ``text``, and nothing between."""
     with replacing(path) as fresh:
         fresh.write_text(text, encoding="utf-8")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write, renamed to ``path`` when the block ends and it is on the disk; removed if the block raises.
+    """Give a file to write, and rename it to ``path`` when the block ends and the file is on the disk.
 
-    If the process is killed it is left over; the next writer of ``path`` overwrites it.
+    If the block raises, the file is removed. If the process is killed, the file is left over, and the next writer of
+    ``path`` overwrites it.
     """
     fresh = path.with_name(f".{path.name}.new")
     try:
@@ -91,24 +99,27 @@ def sync(path: Path) -> None:
 
 
 def plain_name(name: str) -> bool:
-    """Whether a text can name a sub-goal or the like: a file's name on every system. Any script is fine."""
+    """Return whether a text can name a sub-goal or the like, and so be a file's name on every system.
+
+    Letters of any script are allowed.
+    """
     return name.isprintable() and name.strip(" .") == name != "" and not set(name) & set(f"{NO_FILE_NAME}/\\")
 
 
 def plain_names(names: Sequence[str]) -> bool:
-    """Whether there are names, all plain, that differ even if case is ignored."""
+    """Return whether there are names, all of them plain, that differ even if case is ignored."""
     different = {name.casefold() for name in names}
     return len(different) == len(names) > 0 and all(map(plain_name, names))
 
 
 def visible(folder: Path, pattern: str) -> list[Path]:
-    """The paths below a folder that match a pattern, sorted; hidden ones, such as drafts, are left out."""
+    """Return the paths below a folder that match a pattern, sorted, without hidden paths such as drafts."""
     paths = [path for path in folder.rglob(pattern) if "/." not in f"/{path.relative_to(folder).as_posix()}"]
     return sorted(paths)
 
 
 def as_json(facts: Any) -> str:
-    """Text of facts and numbers, NumPy's too; NaN becomes null."""
+    """Return facts and numbers, also NumPy's, as a JSON text. NaN becomes null."""
     return to_json(
         facts,
         indent=1,

@@ -1,8 +1,8 @@
-"""User code, named ``module:object``: when it is loaded, and where an error of it lies.
+"""The user's own code, named ``module:object``: when it is loaded, and where an error in it lies.
 
 A name that the user typed, on the command line or in a call from Python, is loaded. A name in a file (a manifest, a
 data file, a preset, an experiment in TOML) is loaded only with ``--trust``, or with ``HYPOGOAL_TRUST=1`` in the
-environment. Installed packages with an entry point need neither.
+environment. Installed packages with an entry point need neither of the two.
 """
 
 import errno
@@ -23,10 +23,10 @@ from hypogoal.core.errors import NumericalError, UserError
 
 TRUST = "--trust"
 VARIABLE = "HYPOGOAL_TRUST"
-TYPED = "HYPOGOAL_TYPED"  # in the environment: names that were typed in the process that started this one
+TYPED = "HYPOGOAL_TYPED"  # an environment variable with the names that were typed in the parent process
 NAMES = re.compile(r"--trust|[\w.]+:[^\W\d][\w.]*")
-CALLED = re.compile(r"([\w.<>]+)\(\) (?:takes|missing|got)")  # an error of a call with other arguments
-MOST_QUOTED = 200  # characters of an error
+CALLED = re.compile(r"([\w.<>]+)\(\) (?:takes|missing|got)")  # the message of a call with wrong arguments
+MOST_QUOTED = 200  # the largest number of characters that are quoted of an error
 PACKAGE = str(Path(__file__).parents[1]) + os.sep
 LIBRARIES = (*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), PACKAGE, "<")
 NO_MEMORY = "there is not enough memory. Choose a smaller batch_size, fewer environments or --set workers=1."
@@ -41,34 +41,40 @@ _allowed: set[str] = set()  # what the user typed in this process
 
 
 def names_in(text: object) -> list[str]:
-    """The names ``module:object`` in a word of a command, as in ``network=mine:net``, and ``--trust``."""
+    """Return the names ``module:object`` in a word of a command, as in ``network=mine:net``, and ``--trust``."""
     return NAMES.findall(str(text))
 
 
 def allow(texts: Iterable[object]) -> None:
-    """Note what the user typed: names in it may be loaded; with ``--trust`` any name."""
+    """Note what the user typed.
+
+    Names in the texts may be loaded from now on, and any name may be loaded if ``--trust`` is among them.
+    """
     for text in texts:
         _allowed.update(names_in(text))
 
 
 def is_in_program() -> bool:
-    """Whether the user named code of the program itself, ``__main__:object``."""
+    """Return whether the user named code of the program itself, ``__main__:object``."""
     return any(name.startswith("__main__:") for name in _allowed)
 
 
 def environment() -> dict[str, str]:
-    """For processes that this one starts: they may load what the user typed here, no more."""
+    """Return environment variables for child processes, which may load what the user typed here and nothing else."""
     return {TYPED: " ".join(sorted(_allowed))} if _allowed else {}
 
 
 def command(*words: object) -> str:
-    """The command ``hypogoal *words`` as one would type it next; with ``--trust`` if this one has code of its own."""
+    """Return the command ``hypogoal *words`` as the user would type it next.
+
+    If this process uses code of the user's own, the command has ``--trust``.
+    """
     trust = [TRUST] if _allowed else []
     return shlex.join(["hypogoal", *map(str, words), *trust])
 
 
 def require_trust(name: str, role: str) -> None:
-    """Refuse (``UserError``) a ``module:object`` that the user neither typed nor trusts; other names pass."""
+    """Raise ``UserError`` for a ``module:object`` that the user neither typed nor trusts. Other names pass."""
     typed = _allowed.union(os.environ.get(TYPED, "").split())
     trusted = name in typed or TRUST in typed or os.environ.get(VARIABLE) == "1"
     if ":" in name and not trusted:
@@ -77,10 +83,11 @@ def require_trust(name: str, role: str) -> None:
 
 
 def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
-    """The object called ``name``: one of ``built_in``, an installed entry point of ``group``, or ``module:object``.
+    """Return the object called ``name``.
 
-    Modules in the current folder can be loaded too; installed ones come first. An unknown name, one that cannot be
-    loaded, and code that the user did not allow are a ``UserError``, whose message calls it by its ``role``.
+    ``name`` is one of ``built_in``, an installed entry point of ``group``, or ``module:object``. Modules in the current
+    folder can be loaded, too, but installed modules come first. Raises ``UserError`` if the name is unknown, if the
+    object cannot be loaded, or if the user did not allow the code. The message calls the object by its ``role``.
     """
     places = dict(built_in)
     if name not in places:
@@ -101,7 +108,7 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
 
 
 def load_class(name: str, role: str, base: type[Kind], built_in: Mapping[str, str], group: str = "") -> type[Kind]:
-    """The subclass of ``base`` called ``name``, see :func:`load`; anything else is a ``UserError``."""
+    """Return the subclass of ``base`` called ``name``, see :func:`load`. Raises ``UserError`` for anything else."""
     kind = load(name, role, group, built_in)
     do = f"Give a subclass of {base.__module__}.{base.__name__}."
     if not (inspect.isclass(kind) and issubclass(kind, base)):
@@ -112,7 +119,10 @@ def load_class(name: str, role: str, base: type[Kind], built_in: Mapping[str, st
 
 
 def place_of(error: BaseException) -> str:
-    """``file.py, line 3``: the innermost user code in an error's traceback; empty if there is none."""
+    """Return the innermost user code in an error's traceback, as ``file.py, line 3``.
+
+    The text is empty if there is no user code.
+    """
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if not frame.filename.startswith(LIBRARIES):
             return f"{Path(frame.filename).name}, line {frame.lineno}"
@@ -120,7 +130,10 @@ def place_of(error: BaseException) -> str:
 
 
 def culprit_of(error: BaseException) -> str:
-    """The user's function that takes other arguments, or class that lacks an attribute; empty if there is none."""
+    """Return the user's function that takes other arguments, or the user's class that lacks an attribute.
+
+    The text is empty if there is no such function or class.
+    """
     if isinstance(error, TypeError) and (called := CALLED.match(str(error))):
         return called[1]
     kind = type(getattr(error, "obj", None))
@@ -129,7 +142,10 @@ def culprit_of(error: BaseException) -> str:
 
 
 def of_user(error: BaseException) -> UserError | None:
-    """An error that was raised in or through user code, as a ``UserError``; None for any other."""
+    """Return an error that was raised in or through the user's code as a ``UserError``.
+
+    Returns None for any other error.
+    """
     place = place_of(error) or (culprit_of(error) if _allowed else "")
     if not place or isinstance(error, UserError | NumericalError):
         return None
@@ -137,7 +153,10 @@ def of_user(error: BaseException) -> UserError | None:
 
 
 def message(error: BaseException) -> tuple[str, int]:
-    """The line and the exit code for an error that ends a command: 2 for the user's mistakes, 1 for others."""
+    """Return the line and the exit code for an error that ends a command.
+
+    The code is 2 for the user's mistakes and 1 for other errors.
+    """
     if isinstance(error, UserError):
         return str(error), 2
     if isinstance(error, NumericalError):
@@ -159,6 +178,6 @@ def message(error: BaseException) -> tuple[str, int]:
 
 
 def _line(error: BaseException) -> str:
-    """``KeyError: 'key'``: the kind and the first line of an error."""
+    """Return the kind and the first line of an error: ``KeyError: 'key'``."""
     first, *_ = str(error).splitlines() or [""]
     return f"{type(error).__name__}: {first[:MOST_QUOTED]}"

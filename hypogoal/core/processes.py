@@ -1,4 +1,4 @@
-"""Where work runs: in processes of their own, on a device, with one thread of torch's; how it is stopped."""
+"""Where work runs: in child processes, on a device, with one torch thread. Also how work is stopped."""
 
 import multiprocessing
 import os
@@ -18,27 +18,27 @@ from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 
 T = TypeVar("T")
-CORES = "HYPOGOAL_CORES"  # in the environment: how many cores a stage may use
+CORES = "HYPOGOAL_CORES"  # an environment variable that says how many cores a stage may use
 DEVICES = ("auto", "cpu", "cuda")
-# Libraries use one thread per process, unless the user sets these.
+# Libraries use one thread per process, unless the user sets these environment variables.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
-GROUPS = (Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"))  # Linux's: those of this process, their limits
+GROUPS = (Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"))  # on Linux, this process's control groups and their limits
 
-_turn = threading.RLock()  # a stage may call another one
+_turn = threading.RLock()  # can be acquired again, because a stage may call another stage
 
 
 def stop(number: int, _frame: FrameType | None) -> None:
-    """A handler of signals: ``KeyboardInterrupt`` wherever Python is, with the signal's number as its argument."""
-    for each in SIGNALS:  # another one would interrupt the clean-up
+    """Handle a signal: raise ``KeyboardInterrupt`` wherever Python is, with the signal's number as its argument."""
+    for each in SIGNALS:  # ignored from now on, because another signal would interrupt the clean-up
         signal.signal(each, signal.SIG_IGN)
     raise KeyboardInterrupt(number)
 
 
 def cores() -> int:
-    """How many cores this process may use: those the system allows, or fewer with ``HYPOGOAL_CORES``.
+    """Return how many cores this process may use: those that the system allows, or fewer with ``HYPOGOAL_CORES``.
 
-    A quota of its control groups counts in whole cores, rounded up.
+    A quota of the process's control groups counts in whole cores, rounded up.
     """
     affinity = getattr(os, "sched_getaffinity", None)  # not on every system
     count = len(affinity(0)) if affinity else os.cpu_count()
@@ -46,7 +46,10 @@ def cores() -> int:
 
 
 def quota(groups: Path, limits: Path) -> float:
-    """How many cores' time the control groups of a process have, of either version; infinite without a limit."""
+    """Return how many cores' time the control groups of a process have, or infinity without a limit.
+
+    Control groups of both versions are read.
+    """
     least = inf
     if not groups.is_file():
         return least
@@ -54,7 +57,7 @@ def quota(groups: Path, limits: Path) -> float:
         _, controllers, place = line.split(":", 2)
         for within in (Path(place), *Path(place).parents):  # a container sees its own group as the root
             folder = limits / controllers / within.relative_to("/")
-            with suppress(OSError, ValueError, ZeroDivisionError):  # no file: not limited here; "max"
+            with suppress(OSError, ValueError, ZeroDivisionError):  # without a file, or with "max", there is no limit
                 if controllers:
                     texts = [(folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period")]
                 else:
@@ -66,7 +69,7 @@ def quota(groups: Path, limits: Path) -> float:
 
 
 def allowed(wanted: int) -> int:
-    """How many of ``wanted`` processes (0: one per core) a stage may use."""
+    """Return how many of ``wanted`` processes a stage may use. With ``wanted`` 0, that is one process per core."""
     return min(wanted, int(os.environ.get(CORES, wanted))) if wanted else cores()
 
 
@@ -77,14 +80,19 @@ def in_processes(
     *,
     forked: bool = False,
 ) -> None:
-    """Run tasks, ``workers`` at once; ``done`` gets each task's number and result.
+    """Run tasks, ``workers`` of them at once. ``done`` is called with each task's number and result.
 
-    One at once runs in this process, and so do all in a process that may not have others, as those of a ``Pool``. In
-    other processes tasks and results must be picklable. If a task fails, or at Ctrl-C, running ones are ended.
+    With one worker, the tasks run in this process. They also do so in a process that may not have children, such as
+    those of a ``Pool``. In child processes, tasks and results must be picklable. If a task fails, or at Ctrl-C, running
+    tasks are ended.
 
-    Processes are spawned, and import what they need, for some 3 s each: a fork copies the caller's locks, and CUDA does
-    not survive it. ``forked`` is for tasks that need neither; it holds on Linux only. The program that called is not
-    run again in spawned ones: it may have no file, or no main guard.
+    Child processes are spawned and import what they need, which takes some 3 s each. They are not forked because a fork
+    copies the caller's locks, and CUDA does not survive a fork. ``forked`` is for tasks that need neither locks nor
+    CUDA, and it has an effect on Linux only. The program that called is not run again in spawned processes, because it
+    may have no file, or no main guard.
+
+    Raises:
+        UserError: if processes cannot share memory, or if a process was killed or could not start.
     """
     workers = min(workers, len(tasks))
     if workers <= 1 or multiprocessing.current_process().daemon:
@@ -116,7 +124,7 @@ def in_processes(
 
 @contextmanager
 def _without_program() -> Iterator[None]:
-    """Processes that are spawned within it do not run the program, unless code of it is asked for."""
+    """Keep processes that are spawned within the block from running the program, unless its code is asked for."""
     program = sys.modules["__main__"]
     if not own_code.is_in_program():
         sys.modules["__main__"] = ModuleType("__main__")
@@ -127,15 +135,15 @@ def _without_program() -> Iterator[None]:
 
 
 def _begin(environment: Mapping[str, str]) -> None:
-    """What a process does first."""
+    """Do what a child process does first: set its environment and its handlers of signals, and watch its parent."""
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C, and ends this process
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: a fork has its parent's handler, which ends a task alone
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has its parent's handler, which would end only a task
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """An orphan would write beside its successor."""
+    """End this process when its parent ends, because an orphan would write beside its successor."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -146,7 +154,7 @@ def _run(task: Callable[[], T]) -> T:
     try:
         return task()
     except BaseException as error:
-        user_error = own_code.of_user(error)  # its place is only known here: tracebacks are not sent to the parent
+        user_error = own_code.of_user(error)  # here, because tracebacks, which tell the place, are not sent on
         if user_error is None:
             raise
         raise user_error from error
@@ -154,7 +162,7 @@ def _run(task: Callable[[], T]) -> T:
 
 @contextmanager
 def surroundings() -> Iterator[None]:
-    """Within it this process has the environment of those that it starts."""
+    """Give this process, within the block, the environment variables that its child processes get."""
     before = dict(os.environ)
     # A process that starts others imports no random.py from the current folder.
     os.environ.update({**dict.fromkeys(THREADS, "1"), **before, **own_code.environment(), "PYTHONSAFEPATH": "1"})
@@ -166,18 +174,18 @@ def surroundings() -> Iterator[None]:
 
 
 def prepare(device: str = "auto") -> str:
-    """Use one torch thread without denormal numbers; returns ``cpu`` or ``cuda`` (``auto`` is the CPU).
+    """Set torch to one thread and without denormal numbers. Return ``cpu`` or ``cuda`` (``auto`` is the CPU).
 
-    One thread per process is as fast on small networks, does not suffer from busy neighbours, and gives the same bytes
-    again on the same machine; other processors round differently. Denormal numbers (below 1e-38, where Adam's moments
-    of unused weights end) count as 0: arithmetic with them takes many times as long. An unknown device, or one that
-    torch does not find, is a ``UserError``.
+    One thread per process is as fast on small networks and does not suffer from busy neighbours. It gives the same
+    bytes again on the same machine, while other processors round differently. Denormal numbers are below 1e-38, which
+    is where Adam's moments of unused weights end. They count as 0, because arithmetic with them takes many times as
+    long. Raises ``UserError`` if the device is unknown, or if torch does not find it.
     """
     import numpy
     import torch
 
     for kind in (numpy.float32, numpy.float64):
-        numpy.finfo(kind)  # while there are denormal numbers: else NumPy 2.3 and older warn that there are none
+        numpy.finfo(kind)  # before denormal numbers are off, because NumPy 2.3 and older warn if there are none
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     if device not in DEVICES:
@@ -189,9 +197,9 @@ def prepare(device: str = "auto") -> str:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """torch as if nobody had changed its settings; afterwards they are the caller's again.
+    """Run the block with torch's default settings, and restore the caller's settings afterwards.
 
-    Most are of the whole process, so its threads take turns.
+    Most of the settings belong to the whole process, so its threads take turns.
     """
     import torch
 

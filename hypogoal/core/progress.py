@@ -1,4 +1,4 @@
-"""What is printed: lines, and progress on stderr, a line that changes; and the log of a training."""
+"""What is printed: lines, and progress, which is a changing line on stderr. Also the log of a training."""
 
 import json
 import math
@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Any, Self
 
 LINE = "{desc}: {n_fmt}/{total_fmt} in {elapsed}, {remaining} left{postfix}"
-FIRST_SECONDS = 1.0  # nothing is said of what takes less
-REDRAW_SECONDS = 0.2  # in a terminal
-LINE_SECONDS = 10.0  # elsewhere
+FIRST_SECONDS = 1.0  # work that takes less time shows no progress
+REDRAW_SECONDS = 0.2  # the time between two updates in a terminal
+LINE_SECONDS = 10.0  # the time between two updates if the output is no terminal
 
 
 class Progress:
-    """``with Progress("train-meta", total=300_000) as progress: progress.advance(32, success=0.5)``.
+    """A progress line: ``with Progress("train-meta", total=300_000) as progress: progress.advance(32, success=0.5)``.
 
     Attributes:
-        total: may be set later, where it is not known at the beginning.
-        done: units done.
+        total: the number of units of work. It may be set later if it is not known at the beginning.
+        done: the number of units done.
     """
 
     def __init__(self, title: str, total: int, quiet: bool = False):
-        from tqdm import tqdm  # not before: it takes as long to import as the whole command line
+        from tqdm import tqdm  # imported here, because the import takes as long as that of the whole command line
 
         self.total = total
         self.done = 0
@@ -44,11 +44,14 @@ class Progress:
         self._bar.close()
 
     def resume(self, done: int) -> None:
-        """``done`` units were done before this moment."""
+        """Count ``done`` units as done before this moment."""
         self.done = self._bar.n = self._bar.initial = done
 
     def advance(self, n: int = 1, **numbers: float) -> None:
-        """``n`` more units are done; ``numbers`` are shown beside them, except NaN (not known yet)."""
+        """Count ``n`` more units as done.
+
+        ``numbers`` are shown beside the count, except NaN, which stands for not known yet.
+        """
         shown = {name: value for name, value in numbers.items() if not math.isnan(value)}
         if shown:
             self._bar.set_postfix(shown, refresh=False)
@@ -57,21 +60,21 @@ class Progress:
         self._bar.update(n)
 
     def update(self, done: int, **numbers: float) -> None:
-        """``done`` units are done in total."""
+        """Set the number of units done in total to ``done``."""
         self.advance(done - self.done, **numbers)
 
 
 def duration(seconds: float) -> str:
-    """A time as progress lines have it: ``03:20``, or ``1:03:20``."""
+    """Return a time as progress lines show it: ``03:20``, or ``1:03:20``."""
     from tqdm import tqdm
 
     return str(tqdm.format_interval(seconds))
 
 
 class MetricsLog:
-    """``metrics.jsonl``: one JSON object per line; the file is not kept open.
+    """The file ``metrics.jsonl``, which has one JSON object per line and is not kept open.
 
-    With a folder ``tensorboard``, which may exist, TensorBoard gets the numbers too, if it is installed.
+    With a folder ``tensorboard``, which may exist already, TensorBoard gets the numbers, too, if it is installed.
     """
 
     def __init__(self, path: Path, tensorboard: Path | None = None):
@@ -84,7 +87,7 @@ class MetricsLog:
         path.touch()
 
     def write(self, **values: Any) -> None:
-        """Append one line, with a ``step`` among its values."""
+        """Append one line. ``step`` must be among its values."""
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(values) + "\n")
         if self._board is None:
@@ -94,12 +97,12 @@ class MetricsLog:
                 self._board.add_scalar(name, value, values["step"])
 
     def close(self) -> None:
-        """Write what TensorBoard has not got yet."""
+        """Write the numbers that TensorBoard has not got yet."""
         if self._board is not None:
             self._board.close()
 
     def snapshot(self) -> int:
-        """Flush the file to disk and return its length in bytes."""
+        """Flush the file to disk, and return its length in bytes."""
         with self._path.open("a") as file:
             os.fsync(file.fileno())
             return os.fstat(file.fileno()).st_size
@@ -110,7 +113,10 @@ class MetricsLog:
 
 
 def say(*lines: object, err: bool = False) -> None:
-    """Print lines on standard output or error; letters that it cannot show as their numbers."""
+    """Print lines on standard output, or on standard error if ``err`` is true.
+
+    Letters that the stream cannot show are printed as their numbers.
+    """
     stream = sys.stderr if err else sys.stdout
     for line in lines:
         try:

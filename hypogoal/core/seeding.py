@@ -1,7 +1,8 @@
-"""Randomness is passed in: every consumer gets its own stream, named after its purpose.
+"""Random streams: randomness is passed in, and every consumer gets its own stream, named after its purpose.
 
-Names of 0 at a stream's end make no difference, since NumPy pads what it is given with zeros: ``seed_for(0, "x")`` is
-``seed_for(0, "x", 0)``. No two streams in use differ by that alone. It stays so, since other seeds are other results.
+Names of 0 at a stream's end make no difference, because NumPy pads what it is given with zeros: ``seed_for(0, "x")`` is
+``seed_for(0, "x", 0)``. No two streams in use differ by such a name alone. This behaviour is kept, because other seeds
+would give other results.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ def _sequence(seed: int, names: tuple[str | int, ...]) -> np.random.SeedSequence
 
 
 def seed_for(seed: int, *names: str | int) -> int:
-    """A 63-bit seed for the stream called ``names`` of run ``seed``."""
+    """Return a 63-bit seed for the stream called ``names`` of run ``seed``."""
     sequence = _sequence(seed, names)
     state = sequence.generate_state(1, np.uint64)
     return int(state[0] >> 1)
 
 
 def rng_for(seed: int, *names: str | int) -> np.random.Generator:
-    """A NumPy generator for the stream called ``names`` of run ``seed``."""
+    """Return a NumPy generator for the stream called ``names`` of run ``seed``."""
     sequence = _sequence(seed, names)
     return np.random.default_rng(sequence)
 
 
 def torch_generator(seed: int, *names: str | int) -> torch.Generator:
-    """A torch CPU generator for the stream called ``names`` of run ``seed``."""
+    """Return a torch CPU generator for the stream called ``names`` of run ``seed``."""
     import torch
 
     generator = torch.Generator()

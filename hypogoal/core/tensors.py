@@ -1,4 +1,4 @@
-"""Weights on disk: safetensors only, no pickle is ever loaded."""
+"""Weights on disk, as safetensors only: no pickle is ever loaded."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def stored(tensors: Mapping[str, Any], owner: str) -> bytes:
-    """Tensors or arrays by name as a file has them. NaN or Inf is a ``NumericalError``."""
+    """Return tensors or arrays by name as the bytes of a file. Raises ``NumericalError`` for NaN or Inf."""
     import torch
     from safetensors.torch import save
 
@@ -26,18 +26,18 @@ def stored(tensors: Mapping[str, Any], owner: str) -> bytes:
         tensor = torch.as_tensor(values)
         if not tensor.isfinite().all():
             raise NumericalError(f"the weight {name} of {owner} is NaN or Inf; a mask of these needs persistent=False")
-        # a copy: where two layers share a weight, safetensors would refuse it
+        # Cloned, because safetensors would refuse a weight that two layers share.
         weights[name] = tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
     return save(weights)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
-    """Write what is :func:`stored` of tensors or arrays by name; nothing where they cannot be."""
+    """Write tensors or arrays by name as :func:`stored` gives them. Nothing is written if :func:`stored` raises."""
     path.write_bytes(stored(tensors, path.stem))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:
-    """Read tensors by name. A file that is missing, cut or not safetensors is a ``UserError``."""
+    """Return the tensors of a file by name. Raises ``UserError`` if the file is missing, cut, or not safetensors."""
     from safetensors.torch import load_file
 
     with reading(path, AGAIN, "the weights"):
@@ -45,7 +45,7 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors whose names begin with a prefix, by the rest of the name."""
+    """Return the tensors whose names begin with a prefix, by the rest of the name."""
     inner = {}
     for name, tensor in tensors.items():
         if name.startswith(prefix):
@@ -54,7 +54,7 @@ def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def load_into(module: M, weights: Mapping[str, Tensor], where: str) -> M:
-    """The module with these weights; a ``UserError`` if they do not fit it."""
+    """Load weights into a module, and return the module. Raises ``UserError`` if the weights do not fit."""
     try:
         module.load_state_dict(weights)
     except RuntimeError as error:
@@ -63,9 +63,9 @@ def load_into(module: M, weights: Mapping[str, Tensor], where: str) -> M:
 
 
 def load_fitting(make: Callable[[], M], weights: Mapping[str, Tensor], where: str) -> M:
-    """The module that ``make`` builds, with these weights; a ``UserError`` if they do not fit it."""
+    """Return the module that ``make`` builds, with ``weights``. Raises ``UserError`` if the weights do not fit."""
     import torch
 
-    with torch.random.fork_rng(devices=[]):  # the first weights, which are replaced
+    with torch.random.fork_rng(devices=[]):  # so that drawing the first weights, which are replaced, has no effect
         module = make()
     return load_into(module, weights, where)

@@ -23,7 +23,7 @@ policies that learn:
   the value of the state counts for both policies, but the trace of the policy over options ends.
 
 With ``restart_options``, the end of an execution is also the end of its episode, and the episode counts as cut. With
-``experience=shared``, every member of a sub-goal learns from each step, each member by its own prediction of the state.
+``experience=shared``, every member of every sub-goal learns from each step, by its own prediction of the state.
 """
 
 from dataclasses import dataclass
