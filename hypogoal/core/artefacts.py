@@ -30,7 +30,7 @@ LOG = "metrics.jsonl"
 SUMMARY = "summary.txt"  # what `evaluate` and `compare` print
 TO_FILL_IN = "labels.csv"  # a table that the manifest does not list, because people change it
 DATA = "data"  # the kind of an output that is an HDF5 file
-PATIENCE_SECONDS = 2.0  # a process that is just ending may still hold the lock
+PATIENCE_SECONDS = 2.0  # to wait for the lock, because a process that is just ending may still hold it
 NO_RESULT = ("workers",)  # settings that change no result
 AGAIN = "Make the artefact again."
 PACKAGES = (
@@ -43,8 +43,8 @@ class Input(BaseModel):
     """What an artefact was made from: an artefact or a file, with its :func:`sha256_of`."""
 
     kind: str
-    path: str  # as it was given
-    relative: str  # from the artefact's folder
+    path: str  # as the user gave it
+    relative: str  # the path from the artefact's folder
     sha256: str
 
 
@@ -226,7 +226,7 @@ class Draft:
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire()
-        except (Timeout, FileNotFoundError):  # not found: its owner has just removed the folder
+        except (Timeout, FileNotFoundError):  # the file is not found if its owner has just removed the folder
             do = "Wait until it is done, or choose another --out."
             raise UserError("another process is writing this", self.out, do) from None
         except OSError as error:

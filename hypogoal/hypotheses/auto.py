@@ -72,7 +72,7 @@ class Tried:
 
     weight: float
     accuracy: float
-    disagreement: float | None  # None with one member
+    disagreement: float | None  # None if there is one member
     constant: bool  # some member predicts one class for all unlabelled states
     contrary: bool  # members differ on more than half of the unlabelled states
     kept: bool

@@ -23,10 +23,10 @@ from hypogoal.observations import NUMBERS, Observations, Shape, packed, type_of,
 THRESHOLD = 0.5  # the probability above which a prediction is positive, unless another threshold is set
 IMAGES_AT_ONCE = 64  # images in a plain forward pass that fit a CPU's cache; a GPU takes 16 times as many
 PATCH_CHUNK = 4096  # images in a pass if they have few distinct patches
-FOLD_FROM = 32  # images from which folding BatchNorm into the convolutions pays
-PATCHES_FROM = 256  # images from which looking for distinct patches pays
+FOLD_FROM = 32  # from this number of images on, folding BatchNorm into the convolutions pays
+PATCHES_FROM = 256  # from this number of images on, looking for distinct patches pays
 
-if os.name == "posix":  # a forked process has none of its parent's threads, for which torch would wait for ever
+if os.name == "posix":  # torch would wait for ever for its parent's threads, which a forked process does not have
     os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))
 
 

@@ -34,7 +34,7 @@ OTHERWISE = "mlp"
 JOINT = 256  # units of the dense layer that joins the keys of mixed observations
 Parts = tuple[list[nn.Module], tuple[int, ...]]  # the convolutional layers, and the widths of hidden dense layers
 MOST_NUMBERS = 2**24  # numbers in the states of one pass without gradients, which take some 400 MB inside a network
-ENTRY_POINTS = "hypogoal.networks"  # with which other packages add networks
+ENTRY_POINTS = "hypogoal.networks"  # the entry point group by which other packages add networks
 
 
 def _convolution(

@@ -14,7 +14,7 @@ from hypogoal.core.progress import MetricsLog, Progress
 from hypogoal.core.tensors import load_tensors
 from hypogoal.options.loop import OptionLoop
 
-LOG_INTERVAL = 2_000  # environment steps
+LOG_INTERVAL = 2_000  # environment steps between two lines of the log
 
 
 def train(

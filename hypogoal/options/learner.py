@@ -50,9 +50,10 @@ class Learner(Part, ABC):
         config: how options are executed.
         settings: how the policies learn, which is the part ``config.learner``.
         option_steps: int64 (O,), the number of steps from which each option's policy learned.
-        positives: int64 (O,), the number of those steps at whose end the option's sub-goal was reached.
+        positives: int64 (O,), the number of steps among ``option_steps`` at whose end the option's sub-goal was
+            reached.
         steps_since_positive: int64 (O,), the number of steps since the first step at whose end the sub-goal was
-            reached. Steps of a run that this run continues are included.
+            reached. If this run continues another run, the steps of that run are included.
 
     Raises:
         UserError: if settings do not go together, or if the replay is longer than the engine's memory of states.

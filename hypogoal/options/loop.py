@@ -136,7 +136,7 @@ class OptionLoop(Resumable):
         return learned_by(self.learner) | learned_by(self.chooser)
 
     def advance(self, *, learning: bool = True) -> Transitions:
-        """Step every environment once, without the updates that are due. Return what happened.
+        """Step every environment once, without the updates that are due, and return the step as :class:`Transitions`.
 
         Without ``learning`` the agent is frozen: options are greedy, and nothing is kept from which the agent could
         learn.
