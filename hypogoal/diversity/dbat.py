@@ -12,15 +12,15 @@ def pair_loss(
 
     Eq. (1) as printed multiplies the probabilities of matching classes, which literally rewards agreement. D-BAT's term
     is the log probability that two members, each drawing a class from its own p, draw different classes. The loss is
-    computed from log-softmax. From probabilities, a logit gap of 20 would already give log 0 and a gradient of NaN.
+    computed from log-softmax. From probabilities, a logit gap of 20 would already give log 0 and a gradient of NaN. The
+    loss is lower where the members disagree, 0 for N = 0, and symmetric in a and b.
 
     Args:
         logits_a: float (..., N, 2), the logits of one member on N unlabelled states; column 1 is positive.
         logits_b: float (..., N, 2), the logits of another member on the same states.
 
     Returns:
-        float (...,), at least 0, in nats. The loss is lower where the members disagree, 0 for N = 0, and symmetric in a
-        and b.
+        The loss, float (...,), at least 0, in nats.
 
     Source: Eq. (1) and arXiv:2202.04414 (D-BAT).
     """

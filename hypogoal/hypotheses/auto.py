@@ -84,10 +84,9 @@ def held_out(labels: Bools, groups: Ints | None, seed: int) -> tuple[list[Bools]
     States are assigned to ``FOLDS`` folds at random. Every fold has about the same share of each class. All states of a
     group are in the same fold, unless fewer than ``FOLDS`` groups have states of a class.
 
-    Returns:
-        The folds, a list of bool (N,) arrays that are true for held-out states, and a remark that a user should know.
-        The list has one fold, or all folds if the first fold has fewer than ``FEWEST`` states of a class. The list is
-        empty if a class has fewer than ``FEWEST`` labels in all. The remark is empty if there is nothing to know.
+    Returns the folds, a list of bool (N,) arrays that are true for held-out states, and a remark that a user should
+    know. The list has one fold, or all folds if the first fold has fewer than ``FEWEST`` states of a class. The list is
+    empty if a class has fewer than ``FEWEST`` labels in all. The remark is empty if there is nothing to know.
     """
     fewest = min(labels.sum(), (~labels).sum())
     if fewest < FEWEST:

@@ -106,11 +106,18 @@ class Ensemble(nn.Module):
     def see(self, observations: Observations) -> Any:
         """Return what the members see of observations.
 
-        Takes the observations that :meth:`predict` takes, and raises ``UserError`` where :meth:`predict` does.
+        Members see pictures uint8 (N, H, W, C) as uint8 (N, h, w, C). They see numbers as float32 (N, *shape),
+        standardised. They see mixed observations as an array (N,) with a field for each key, in which the numbers are
+        standardised.
+
+        Args:
+            observations: N observations, as for :meth:`predict`.
 
         Returns:
-            For pictures uint8 (N, H, W, C): uint8 (N, h, w, C). For numbers: float32 (N, *shape), standardised. For
-            mixed observations: an array (N,) with a field for each key, in which the numbers are standardised.
+            The N observations in the shape and type of the members' view.
+
+        Raises:
+            UserError: if the observations have another shape or type than in training.
         """
         dtype = self.view.dtype
         expected = f"{type_text(dtype)} (N, {', '.join(map(str, self.observation_shape))})"
@@ -184,14 +191,15 @@ class Ensemble(nn.Module):
     ) -> Floats:
         """Return what each member looks at in the observations (Figure 2), see :mod:`hypogoal.hypotheses.deep_lift`.
 
+        A state's attributions sum to the state's log-odds minus the log-odds of the baseline. For mixed observations
+        the attributions are an array (N, K), with a field for each key.
+
         Args:
             observations: the N observations to explain, as for :meth:`predict`.
             against: other observations, for example unlabelled ones. Their mean is the baseline.
 
         Returns:
-            float32 (N, K, H, W, C) for pictures, else (N, K, *the shape of the view), in log-odds. A state's
-            attributions sum to the state's log-odds minus the log-odds of the baseline. For mixed observations the
-            array is (N, K), with a field for each key.
+            float32 (N, K, H, W, C) for pictures, else (N, K, *the shape of the view), in log-odds.
 
         Raises:
             UserError: if the observations have another shape or type than in training.

@@ -38,13 +38,15 @@ def member_scores(predictions: Bools, labels: Bools) -> dict[str, Doubles]:
 def ranking(probabilities: Floats, labels: Bools) -> Doubles:
     """Return the area under the ROC curve: how well members rank positives above negatives, without any threshold.
 
+    The area is the share of pairs of a positive and a negative in which the positive has the higher probability. Ties
+    count half. The area is NaN if there are no such pairs.
+
     Args:
         probabilities: the members' probabilities, float (N, K).
         labels: whether the sub-goal holds, bool (N,).
 
     Returns:
-        float64 (K,): the share of pairs of a positive and a negative in which the positive has the higher probability.
-        Ties count half. NaN if there are no such pairs.
+        The area of each member, float64 (K,).
     """
     from pandas import DataFrame  # imported here, because the import is slow and training does without pandas
 
@@ -58,15 +60,16 @@ def ranking(probabilities: Floats, labels: Bools) -> Doubles:
 def best_threshold(probabilities: Floats, labels: Bools) -> tuple[Floats, Doubles]:
     """Return each member's best threshold for the true sub-goal, and the balanced accuracy at that threshold.
 
-    The threshold is chosen on the labels by which it is scored. So the result is an upper bound, not a method.
+    The threshold is chosen on the labels by which it is scored. So the result is an upper bound, not a method. The
+    accuracies are NaN if all labels are of one class.
 
     Args:
         probabilities: the members' probabilities, float (N, K).
         labels: whether the sub-goal holds, bool (N,).
 
     Returns:
-        Thresholds float32 (K,), above which predictions are positive, and balanced accuracies float64 (K,). The
-        accuracies are NaN if all labels are of one class.
+        Thresholds, float32 (K,), above which predictions are positive.
+        Balanced accuracies, float64 (K,).
     """
     thresholds = np.full(probabilities.shape[1], 0.5, np.float32)
     accuracies = np.full(len(thresholds), np.nan)
