@@ -68,7 +68,7 @@ WORDS = {
 def prose_of(page: Path) -> str:
     """The text of a page without code, headings, comments and the descriptions of pictures."""
     text = page.read_text(encoding="utf-8")
-    for left_out in (r"^```.*?^```", r"<!--.*?-->", r"^#.*?$", r"!\[.*?\]\(.*?\)", r"`[^`\n]+`"):
+    for left_out in (r"^```.*?^```", r"<!--.*?-->", r"^#.*?$", r"!\[.*?\]\(.*?\)", r"`[^`]+`"):
         text = re.sub(left_out, " ", text, flags=re.MULTILINE | re.DOTALL)
     return re.sub(r"\s+", " ", text)
 
