@@ -1,4 +1,4 @@
-"""What the audit's list is worth against random frames, over seeds: the table of docs/audit.md.
+"""What the audit's list is worth against random frames, over seeds: the table of docs/results/audit.md.
 
     python robot_seeds.py robot.csv 11 12 13 14 15
 

@@ -1,7 +1,7 @@
 """How well does an audit tell that a classifier can be fooled? Fifty planted classifiers, whose truth is enumerated.
 
     python -m studies.audits runs/audits audits.csv      # plays and writes the cells; what is there is kept
-    python -m studies.pages                              # writes the tables of docs/audit.md
+    python -m studies.pages                              # writes the tables of docs/results/audit.md
 
 Three worlds: DoorKey (collect-blue-key, the layout 100 + number), rooms (layout 100 + number), and a field of numbers.
 A classifier is the truth and a planted fault: an extra set of states, a background cue (another sub-goal, a bright

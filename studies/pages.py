@@ -35,7 +35,7 @@ from studies import (
 )
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
-PAGES = [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "audit.md"]
+PAGES = sorted(RESULTS.glob("*.md"))
 TABLES: dict[str, Callable[[Path], Iterator[str]]] = {
     "audit-planted": audits.tables,
     "choosing-doorkey": choosing.tables,

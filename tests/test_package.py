@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-BUILD = "import sys; from setuptools import build_meta; getattr(build_meta, f'build_{sys.argv[1]}')(sys.argv[2])"
+SDIST = "import sys; from setuptools import build_meta; build_meta.build_sdist(sys.argv[1])"
+WHEEL = "pip wheel --no-deps --wheel-dir dist ."  # as README has it
 WHERE = "import hypogoal; print(hypogoal.__file__)"
 
 
@@ -27,6 +28,18 @@ def checkout(tmp_path: Path) -> Path:
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, copy / name)
     return copy
+
+
+def builder_of(kind: str, folder: Path) -> list[str]:
+    """The words behind ``python`` that build a package of this kind into a folder."""
+    if kind == "sdist":
+        return ["-c", SDIST, str(folder)]
+    return ["-m", *WHEEL.split(), "--no-build-isolation", "--no-index"]
+
+
+def test_readme_says_how_a_wheel_is_made() -> None:
+    """The command that the test below runs, but for building without a network."""
+    assert f"\n{WHEEL}\n" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -47,8 +60,8 @@ def test_it_installs_elsewhere_and_runs_the_demos_first_stage(kind: str, checkou
 
     package = ["-e", checkout]
     if kind != "editable":
-        built = tmp_path / "dist"
-        subprocess.run([sys.executable, "-c", BUILD, kind, str(built)], cwd=checkout, capture_output=True, check=True)
+        built = checkout / "dist"
+        subprocess.run([sys.executable, *builder_of(kind, built)], cwd=checkout, capture_output=True, check=True)
         package = [*built.iterdir()]
     elsewhere = tmp_path / "environment"
     venv.create(elsewhere)
