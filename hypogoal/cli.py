@@ -22,7 +22,7 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from hypogoal.command import call, registry, stage
+from hypogoal.command import call, stage
 from hypogoal.core import own_code, processes
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
@@ -40,8 +40,8 @@ class Commands(TyperGroup):
 
     def resolve_command(self, context: Any, words: list[str]) -> Any:
         name, *rest = words
-        if name in registry.LISTED:
-            return name, registry.load_stage(name).command, rest
+        if name in stage.LISTED:
+            return name, stage.load_stage(name).command, rest
         return super().resolve_command(context, words)
 
 
@@ -116,7 +116,7 @@ def _commands() -> Any:
 
 def commands() -> dict[str, Any]:
     """Every command by name, those of stages loaded."""
-    of_stages = {name: registry.load_stage(name).command for name in registry.LISTED}
+    of_stages = {name: stage.load_stage(name).command for name in stage.LISTED}
     return _commands().commands | of_stages
 
 
@@ -217,7 +217,7 @@ def run(
     say(*look.outcome(evaluation), out / "report" / "index.html")
 
 
-@command(registry.LOOK, "show runs/mine")
+@command(stage.LOOK, "show runs/mine")
 def show(
     path: Made,
     as_json: Json = False,
@@ -234,7 +234,7 @@ def show(
         say(*write_sheets(path, pictures), err=as_json)
 
 
-@command(registry.LOOK, "verify runs/mine")
+@command(stage.LOOK, "verify runs/mine")
 def verify(path: Made, as_json: Json = False) -> None:
     """Check for missing or changed files; exit code 2 if there are any.
 
@@ -253,7 +253,7 @@ def verify(path: Made, as_json: Json = False) -> None:
         raise typer.Exit(2)
 
 
-@command(registry.LOOK, "status runs/mine")
+@command(stage.LOOK, "status runs/mine")
 def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False) -> None:
     """Say which outputs are out of date or unfinished, why, and how to renew them."""
     from hypogoal import look
@@ -263,7 +263,7 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False
     echo(rows, as_json, [*notes, *look.stale_lines(rows)])
 
 
-@command(registry.LOOK, "config train-ensemble --domain montezuma")
+@command(stage.LOOK, "config train-ensemble --domain montezuma")
 def config(
     stage: Annotated[str, Argument(help="For example train-meta, or run.")],
     domain: Annotated[str, Option(help=f"Settings for: {call.DOMAINS}")] = "doorkey",
@@ -296,11 +296,11 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
             yield from wrapped.wrap(f"{row['meaning']}{allowed}{source}")
 
 
-for _stage, _help in registry.LISTED.items():  # their commands come from them
-    app.command(_stage, help=_help, rich_help_panel=registry.TOOLS.get(_stage, MAKE))(lambda: None)
+for _stage, _help in stage.LISTED.items():  # their commands come from them
+    app.command(_stage, help=_help, rich_help_panel=stage.TOOLS.get(_stage, MAKE))(lambda: None)
 
 
-@command(registry.OWN, "check mine:DOMAIN")
+@command(stage.OWN, "check mine:DOMAIN")
 def check(
     domain: Annotated[str | None, Argument(help=f"{call.DOMAINS[:-1]}; or a data file, FILE.h5.")] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,

@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hypogoal.core.arrays import Array
+from hypogoal.core.arrays import Array, Bools, Ints
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import NO_FILE_NAME, plain_names, reading, replacing
@@ -47,8 +46,6 @@ PLANTED = "planted_"  # begins the names of origins that say whether a state has
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
 COLUMN_CHUNK = 1 << 16  # values of a label or origin
-Labels = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -62,8 +59,8 @@ class States:
     """
 
     observations: Observations
-    labels: Labels
-    origins: Mapping[str, Integers] = field(default_factory=dict)
+    labels: Bools
+    origins: Mapping[str, Ints] = field(default_factory=dict)
 
     def where(self, kept: Array) -> States:
         """The states that are ``kept``, bool (N,), or the rows of some, int (M,)."""
@@ -113,7 +110,7 @@ def joined(parts: Sequence[States]) -> States:
     return States(observations, labels, origins)
 
 
-def doubts_of(labelled: Labels, heldout: Labels, goals: Sequence[str]) -> list[str]:
+def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str]:
     """A line for each sub-goal with few labelled states of a class, or one class only among the held-out states.
 
     Labels are (N, G) and (M, G).
@@ -128,7 +125,7 @@ def doubts_of(labelled: Labels, heldout: Labels, goals: Sequence[str]) -> list[s
     return lines
 
 
-def require_classes(labels: Labels, goals: Sequence[str], where: object, do: str) -> None:
+def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str) -> None:
     """Refuse (``Unmet``) labels (N, G) of labelled states that have one class only for some sub-goal."""
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
@@ -203,7 +200,7 @@ def _is_covered(data: Any) -> bool:
         return bool(np.all(covered))
 
 
-def fixed(text: str) -> NDArray[np.bytes_]:
+def fixed(text: str) -> Array:
     """A text as a fixed-length UTF-8 string, stored in place; variable-length ones lie in HDF5's global heap."""
     import h5py
 

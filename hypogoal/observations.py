@@ -11,8 +11,8 @@ from math import prod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hypogoal.core.arrays import Array, Floats, Ints
 from hypogoal.core.files import plain_names
 
 PICTURE = np.dtype(np.uint8)
@@ -23,9 +23,8 @@ KINDS: dict[str, DType] = {
     "uint8": PICTURE,
     "float32": NUMBERS,
 }
-Observations = NDArray[Any]  # (N, *shape), of any of these types
+Observations = Array  # (N, *shape), of any of these types
 Fields = dict[str, tuple[DType, Shape]]  # by key
-Floats = NDArray[np.float32]
 Standard = tuple[Floats, Floats]  # mean and deviation of numbers
 DIGEST = 16  # bytes
 DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
@@ -140,7 +139,7 @@ def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
     return deviations.clip(-DEVIATIONS, DEVIATIONS)
 
 
-def spread_rows(count: int, most: int) -> NDArray[np.int64]:
+def spread_rows(count: int, most: int) -> Ints:
     """All rows of ``count``, or ``most`` spread evenly, int64 (n,)."""
     wanted = min(count, most)
     return np.linspace(0, count - 1, wanted, dtype=int)

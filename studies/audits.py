@@ -252,7 +252,7 @@ def chosen() -> Iterator[tuple[Planted, str]]:
 def play(run: Path) -> Iterator[dict[str, Any]]:
     """Audit each; a row of a cell."""
     from hypogoal.tools.audit import audit
-    from hypogoal.tools.audits.played import shares_of
+    from hypogoal.tools.audit_played import shares_of
 
     for one, use in chosen():
         out = run / f"{one.world}-{one.number}"

@@ -14,8 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from hypogoal.baselines.engine_env import EngineEnv
-from hypogoal.baselines.networks import CELL, FEATURES, NETWORKS
+from hypogoal.baselines.engine_env import CELL, FEATURES, NETWORKS, EngineEnv
 from hypogoal.baselines.settings import DQNSettings, PPOSettings
 from hypogoal.core.checkpoints import Checkpoints, Resumable, State, restored, snapshot_of
 from hypogoal.core.errors import NumericalError, UserError

@@ -14,7 +14,7 @@ from hypogoal.domains.world import WorldConfig
 class PPOSettings:
     """Hyperparameters of proximal policy optimisation (Schulman et al. 2017); by default the paper's."""
 
-    network: str = "three-conv"  # feature network, see networks.py
+    network: str = "three-conv"  # feature network, see engine_env.py
     environments: int = 4  # stepped together
     rollout: int = 100  # decisions per update, over all environments (Table 5)
     batch: int = 64  # decisions per minibatch (Table 5)
@@ -33,7 +33,7 @@ class DQNSettings:
     Four environments with one update per joint step are its "update interval 4" with a quarter of the overhead.
     """
 
-    network: str = "three-conv"  # feature network, see networks.py
+    network: str = "three-conv"  # feature network, see engine_env.py
     environments: int = 4  # stepped together: one update per joint step
     replay: int = 100_000  # transitions kept (Table 4)
     batch: int = 32  # transitions per update (Table 4)

@@ -2,13 +2,15 @@
 
 ``@stage(...)`` makes of ``train_meta(call, ensemble, *, options=None)`` the command ``hypogoal train-meta ENSEMBLE
 --options PATH --out OUT`` and the function ``hypogoal.train_meta(ensemble, out, options=...)``, with the same
-arguments, settings and checks. What takes time to import is imported when it is called, so that ``--help`` is quick.
+arguments, settings and checks. What takes time to import is imported when it is called, so that ``--help`` is quick;
+``LISTED`` has every stage and tool by the name of its command.
 """
 
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +19,6 @@ import typer
 from typer import Option
 
 from hypogoal.command.call import Call, Done, Place
-from hypogoal.command.registry import LISTED
 from hypogoal.core import own_code
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.core.progress import say
@@ -25,6 +26,21 @@ from hypogoal.core.progress import say
 if TYPE_CHECKING:
     from hypogoal.look import Made
 
+LISTED = {  # every stage and tool in a line, after those whose outputs it reads; it is loaded when it is called
+    "collect": "Collect labelled, unlabelled and held-out states.",
+    "import": "Make a data file of your arrays, pictures or recorded episodes.",
+    "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
+    "train-options": "Learn an option (a policy) for every member.",
+    "train-meta": "Learn from the reward which options to choose.",
+    "train-baseline": "Train PPO or DQN on primitive actions, to compare.",
+    "evaluate": "Compute every number of a run: accuracy, curves, choices.",
+    "report": "Draw the report of an evaluated run: one HTML file.",
+    "compare": "Put evaluated runs side by side: what differs, who wins.",
+    "export": "Write an agent's episodes or an ensemble for other software.",
+    "audit": "How often, and where, do policies fool a success classifier?",
+}
+LOOK, OWN = "Look", "Own data and code"  # groups of commands
+TOOLS = {"compare": LOOK, "import": OWN, "export": OWN, "audit": OWN}
 SET = "Change a setting; see 'hypogoal config'. Repeatable."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET)]
 
@@ -166,6 +182,16 @@ class Stage:
         except Complete as complete:
             say(complete, err=True)
             return call, Done()
+
+
+def load_stage(name: str) -> Stage:
+    """The stage of a command; an unknown one is a ``UserError``."""
+    if name not in LISTED:
+        raise UserError("this is no stage", name, f"Choose one of {', '.join(LISTED)}.")
+    folder = "tools" if name in TOOLS else "stages"
+    word = "import_data" if name == "import" else name.replace("-", "_")
+    function = getattr(import_module(f"hypogoal.{folder}.{word}"), word)
+    return function.stage
 
 
 def _kept(call: Call, then: str) -> Iterator[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hypogoal.cells import HERE, Cell
-from hypogoal.command.registry import load_stage
+from hypogoal.command.stage import load_stage
 from hypogoal.core.config import DOMAIN, STAGES, Config, assigned, resolve
 from hypogoal.core.config import preset as read_preset
 from hypogoal.core.errors import UserError, reason

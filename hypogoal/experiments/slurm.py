@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hypogoal.cells import Cell
-from hypogoal.command.registry import LISTED
+from hypogoal.command.stage import LISTED
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.processes import surroundings

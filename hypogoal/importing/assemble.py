@@ -7,10 +7,11 @@ import numpy as np
 import pandas as pd
 from pandas import DataFrame
 
+from hypogoal.core.arrays import Bools
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import GROUP, Collected, Labels, States, doubts_of, require_classes
+from hypogoal.data import GROUP, Collected, States, doubts_of, require_classes
 from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNLABELLED, Frames, together
 from hypogoal.observations import digest, packed
 
@@ -24,7 +25,7 @@ REMARK = "no held-out states were given: {} of the labelled ones are held out, w
 def assemble(
     source: Path,
     frames: Frames,
-    labels: Labels,
+    labels: Bools,
     goals: Sequence[str],
     features: Sequence[str] = (),
     *,
@@ -76,7 +77,7 @@ def assemble(
     return collected, doubts + remarks + doubts_of(labelled.labels, heldout.labels, goals)
 
 
-def contradictions(table: DataFrame, labels: Labels, goals: Sequence[str]) -> list[str]:
+def contradictions(table: DataFrame, labels: Bools, goals: Sequence[str]) -> list[str]:
     """A line for each sub-goal of which equal states have both labels; a ``UserError`` if a class has no others."""
     lines = []
     judged = table[table["role"] != UNLABELLED]
@@ -120,7 +121,7 @@ def with_roles(table: DataFrame, seed: int) -> DataFrame:
 
 def apart(
     table: DataFrame,
-    labels: Labels,
+    labels: Bools,
     share: float,
     seed: int,
 ) -> tuple[DataFrame, list[str]]:
@@ -153,7 +154,7 @@ def apart(
     return table, lines
 
 
-def held_out(labels: Labels, table: DataFrame, share: float, seed: int) -> Labels:
+def held_out(labels: Bools, table: DataFrame, share: float, seed: int) -> Bools:
     """Which states are held out, bool (N,): whole groups, and without groups all that look alike.
 
     Of each combination of labels (N, G) that groups have, a random ``share``, never all. A remainder of less than one

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hypogoal.core.arrays import Array, Bools
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.own_code import load
-from hypogoal.data import Collected, Labels, joined, open_dataset, write_dataset
-from hypogoal.importing.states import UNLABELLED, Array, Frames
+from hypogoal.data import Collected, joined, open_dataset, write_dataset
+from hypogoal.importing.states import UNLABELLED, Frames
 from hypogoal.observations import NUMBERS, digest
 
 LAST, TABLE = "last:", ".csv"  # how rules begin and end that are no columns
@@ -21,7 +22,7 @@ SUCCESS = ("next.success", "success", "next.reward", "reward", "rewards")  # col
 TRUTHS = {"0": False, "1": True}
 
 
-def labels_of(frames: Frames, rules: Mapping[str, str]) -> Labels:
+def labels_of(frames: Frames, rules: Mapping[str, str]) -> Bools:
     """Whether each sub-goal holds in frames, (N, G), by the rule for it.
 
     A column above 0; ``last:N`` frames of each success; a table, ``FILE.csv``; or ``module:function`` of what is seen,

@@ -28,11 +28,11 @@ from PIL.TiffImagePlugin import (
     TiffImageFile,
 )
 
+from hypogoal.core.arrays import Array, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.progress import say
-from hypogoal.data import Integers
-from hypogoal.importing.states import HELDOUT, LABELLED, UNLABELLED, Array, Episode, files_of
+from hypogoal.importing.states import HELDOUT, LABELLED, UNLABELLED, Episode, files_of
 
 FORMATS = ("PNG", "JPEG", "BMP", "GIF", "WEBP", "TIFF", "PPM", "AVIF")  # for PostScript, Pillow runs a program
 SUFFIXES = {".mpo"}  # that is JPEG
@@ -113,7 +113,7 @@ def read_pictures(folder: Path, sub_goal: str, left: Counter[str]) -> Iterator[E
             )
 
 
-def _state(file: Path, _: Integers) -> list[Array]:
+def _state(file: Path, _: Ints) -> list[Array]:
     """The picture in a file."""
     data = file.read_bytes()
     return [picture_of(data, file)]
@@ -153,7 +153,7 @@ def count_frames(path: Path) -> int:
 
 def frames_in(
     path: Path,
-    rows: Integers,
+    rows: Ints,
     rate: float = 0.0,
     begin: float = 0.0,
 ) -> Iterator[Array]:

@@ -1,4 +1,6 @@
-"""Readers of recorded episodes: Minari, robomimic's HDF5, folders of films, and LeRobotDataset.
+"""Readers of arrays and of recorded episodes: Minari, robomimic's HDF5, folders of films, and LeRobotDataset.
+
+Arrays are a ``.npz`` file, or a folder of ``.npy`` files with the same names.
 
 A LeRobotDataset, formats v2.1 and v3.0, has tables in parquet, frames in films or in the tables, facts in ``meta/``. In
 v2.1 each episode has files of its own, in v3.0 many episodes share files, and ``meta/episodes/`` says where in a film
@@ -15,11 +17,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hypogoal.core.arrays import Array, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import AGAIN, reading
-from hypogoal.data import Integers, opened, whole
+from hypogoal.data import opened, whole
 from hypogoal.importing.pictures import FILMS, count_frames, frames_in, picture_of
-from hypogoal.importing.states import HELDOUT, NAMED, Array, Episode, files_of
+from hypogoal.importing.states import HELDOUT, LABELLED, NAMED, UNLABELLED, Episode, files_of
 
 MINARI = Path("data") / "metadata.json"  # in a dataset's folder
 INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
@@ -29,7 +32,16 @@ DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.
 KEYS = "Choose those that have one by --key; () is a single value, None a broken link."
 MASK = "Give names of data/*, or take the mask out: del file['mask/valid']."
 TABLE = ".csv"  # labels of films, beside them
+# Of each set of states: what the names of its observations begin with, and those of its other arrays.
+SETS = {
+    LABELLED: ("observations", ""),
+    UNLABELLED: ("unlabelled", "unlabelled_"),
+    HELDOUT: ("heldout_observations", "heldout_"),
+}
+NPZ = "Give a .npz file that numpy.savez wrote, of numbers, not of Python objects."
+LABELS = "Give (N,), or (N, sub-goals) and --sub-goal NAME for each column: 1 where it holds, 0 where not."
 
+Arrays = dict[str, Array]  # by name
 Reader = Callable[[Path, Sequence[str]], Iterator[Episode]]  # from a source, the keys to read
 
 
@@ -43,6 +55,60 @@ def reader_of(source: Path, left: Counter[str]) -> Reader | None:
         return read_robomimic
     films = files_of(source, FILMS, Counter())
     return partial(read_films, left=left) if films else None
+
+
+def read_arrays(path: Path, left: Counter[str]) -> Arrays:
+    """The arrays of a file or a folder by name; observations of several keys are ``observations/front`` and so on.
+
+    ``left`` counts other files of the folder.
+    """
+    arrays = {"sub_goals": np.array(["sub-goal"]), "features": np.array([])}
+    for file in files_of(path, (".npy",), left):
+        inner = file.relative_to(path).with_suffix("")
+        with reading(file, NPZ):
+            arrays[inner.as_posix()] = np.load(file)
+    if path.is_file():
+        with reading(path, NPZ), path.open("rb") as raw, np.load(raw) as stored:  # NumPy leaves a cut archive open
+            arrays.update(stored)
+    return arrays
+
+
+def episodes_of(
+    arrays: Arrays,
+    sub_goals: Sequence[str],
+    group: str,
+    left: Counter[str],
+) -> Iterator[Episode]:
+    """The three sets of states as an episode each; labels that do not fit states and sub-goals are a ``UserError``.
+
+    ``group`` names another array, (N,): labelled states with equal values there belong together, and unlabelled ones by
+    the array ``unlabelled_GROUP``. ``left`` counts arrays that are not read.
+    """
+    if group and group not in arrays:
+        names = ", ".join(arrays)
+        raise UserError("no such array", group, f"There are {names}.")
+    rest = arrays.keys() - {"sub_goals", "features"}
+    for role, (name, prefix) in SETS.items():
+        seen = {}
+        for full, values in arrays.items():
+            base, _, key = full.partition("/")
+            if base == name:
+                seen[key] = np.atleast_1d(values)
+                rest.remove(full)
+        count = max(map(len, seen.values()), default=0)
+        unlabelled = 0 if role != UNLABELLED else count
+        labels = arrays.get(f"{prefix}labels", np.zeros((unlabelled, len(sub_goals))))
+        columns = np.atleast_2d(labels.T)
+        if columns.shape != (len(sub_goals), count) or not np.isin(columns, (0, 1)).all():
+            fault = f"labels of {count} {role} states and {len(sub_goals)} sub-goals are not 0 or 1 for each"
+            raise UserError(fault, f"{labels.dtype} {labels.shape}", LABELS)
+        by_goal = dict(zip(sub_goals, columns.astype(bool), strict=True))
+        groups = arrays.get(f"{prefix}{group}", np.full(count, ""))
+        rest -= {f"{prefix}labels", f"{prefix}{group}"}
+        if count:
+            yield Episode(name, count, seen, by_goal, role, groups.astype(str))
+    for name in rest:
+        left[f"array {name!r}"] += 1
 
 
 def read_minari(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
@@ -186,7 +252,7 @@ def _table(file: Path) -> pd.DataFrame:
         return pd.read_parquet(file, engine="pyarrow", dtype_backend="pyarrow", partitioning=None)
 
 
-def _cells(file: Path, column: Any, rows: Integers) -> Iterator[Array]:
+def _cells(file: Path, column: Any, rows: Ints) -> Iterator[Array]:
     """The pictures in cells of a table, ``{bytes, path}``."""
     for cell in column.iloc[rows]:
         yield picture_of(cell["bytes"], file)

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pandas import DataFrame
 
-from hypogoal.core.arrays import Array
+from hypogoal.core.arrays import Array, Floats
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
@@ -241,7 +240,7 @@ def together(states: Sequence[Array], names: Sequence[str], subject: str) -> Arr
     return as_numbers(values, subject)
 
 
-def as_numbers(values: Array, subject: str) -> NDArray[np.float32]:
+def as_numbers(values: Array, subject: str) -> Floats:
     """Numbers (N, ...) as float32, compared before and after.
 
     Columns that are not finite, that float32 cannot hold, or whose values it cannot tell apart are a ``UserError``.

@@ -76,8 +76,8 @@ def _in_play(
     from hypogoal.meta.config import AuditConfig
     from hypogoal.meta.setup import Setup, assemble
     from hypogoal.stages import agents
-    from hypogoal.tools.audits import played
-    from hypogoal.tools.audits.classifiers import classifier_of
+    from hypogoal.tools import audit_played as played
+    from hypogoal.tools.classifiers import classifier_of
 
     config = call.settings(AuditConfig, domain)
     world = load_domain(domain)

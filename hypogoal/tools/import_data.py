@@ -55,11 +55,10 @@ def import_data(
     from hypogoal.core.artefacts import DATA, kind_of
     from hypogoal.data import write_dataset
     from hypogoal.domains.base import IMPORTED
-    from hypogoal.importing.arrays import episodes_of, read_arrays
     from hypogoal.importing.assemble import assemble
     from hypogoal.importing.labels import add_labels, labels_of
     from hypogoal.importing.pictures import POSITIVE, read_pictures
-    from hypogoal.importing.recordings import reader_of
+    from hypogoal.importing.recordings import episodes_of, read_arrays, reader_of
     from hypogoal.importing.states import frames_of
 
     if not source.exists():

@@ -11,7 +11,7 @@ import pytest
 from command_line import refuses, run
 
 from hypogoal import cli
-from hypogoal.command.registry import LISTED, load_stage
+from hypogoal.command.stage import LISTED, load_stage
 from hypogoal.core.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,9 +14,9 @@ from minari.dataset.minari_storage import MinariStorage
 from PIL import Image
 
 from hypogoal.data import Collected
-from hypogoal.importing.arrays import episodes_of, read_arrays
 from hypogoal.importing.assemble import assemble
 from hypogoal.importing.labels import labels_of
+from hypogoal.importing.recordings import episodes_of, read_arrays
 from hypogoal.importing.states import frames_of
 
 SIDE = 48

@@ -19,7 +19,7 @@ from hypogoal.core.artefacts import open_artefact
 from hypogoal.domains.doorkey.engine import KEY, TILE, DoorKeyEngine, tiles
 from hypogoal.evaluation.page import lines_of
 from hypogoal.hypotheses.ensemble import read_ensemble
-from hypogoal.tools.audits.played import CELL, FILMS
+from hypogoal.tools.audit_played import CELL, FILMS
 
 BLUE_FIRST = "101"  # a layout on which the blue key is nearer than the red one
 Pictures = NDArray[np.uint8]

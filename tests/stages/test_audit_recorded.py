@@ -21,7 +21,7 @@ from hypogoal.data import open_dataset
 from hypogoal.evaluation.pictures import picture_of
 from hypogoal.importing.labels import read_table
 from hypogoal.observations import digest
-from hypogoal.tools.audits.classifiers import OwnClassifier
+from hypogoal.tools.classifiers import OwnClassifier
 from tests import mixed
 from tests.mixed import GOAL
 

@@ -13,8 +13,7 @@ from corridor import Corridor
 from gymnasium import spaces
 
 from hypogoal.baselines.agents import epsilon, train
-from hypogoal.baselines.engine_env import EngineEnv
-from hypogoal.baselines.networks import NETWORKS, BlockConvolution
+from hypogoal.baselines.engine_env import NETWORKS, BlockConvolution, EngineEnv
 from hypogoal.baselines.settings import HYPERPARAMETERS
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.checkpoints import Checkpoints

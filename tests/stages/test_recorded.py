@@ -8,7 +8,7 @@ import pytest
 from hypogoal.evaluation.page import lines_of
 from hypogoal.hypotheses.labelling import density_of, disagreement, sketches_of, to_label
 from hypogoal.observations import packed
-from hypogoal.tools.audits.recorded import member_table
+from hypogoal.tools.audit_recorded import member_table
 
 
 def test_members_disagree_about_their_own_thresholds() -> None:

@@ -28,7 +28,7 @@ from hypogoal.observations import PICTURE, standard_of
 from hypogoal.options.loop import OptionLoop
 from hypogoal.options.tables import Exploits
 from hypogoal.options.termination import Terminations, load_rule
-from hypogoal.tools.audits.classifiers import Classifier
+from hypogoal.tools.classifiers import Classifier
 
 BEFORE, MENDED = POLICIES = ("before", "mended")
 CELL = 8  # of positions that count as one place

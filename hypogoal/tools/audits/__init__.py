@@ -1,1 +1,0 @@
-"""What audits say: of policies that exploit a classifier, and of recorded states."""
