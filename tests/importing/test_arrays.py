@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import FIXED, refuses, run, settings
+from command_line import refuses, run
 
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
@@ -14,23 +14,6 @@ from hypogoal.importing.assemble import held_out
 from tests.importing.states import arrays, assembled, pictures
 from tests.mixed import FRONT, STATE
 from tests.mixed import arrays as mixed_arrays
-
-
-def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
-    """Spec B6, A2, A5: a .npz becomes a data file, an ensemble of it judges the held-out states."""
-    np.savez(tmp_path / "own.npz", **arrays())
-    folder = tmp_path / "run"
-    data = folder / "data.h5"
-    said = run("import", tmp_path / "own.npz", "--out", data, "--sub-goal", "at-right")
-    assert said.out.startswith("states: uint8 (48, 48, 3)\n") and not said.err
-    found = open_dataset(data)
-    np.testing.assert_array_equal(found.labelled("at-right").observations, arrays()["observations"])
-    assert found.counts()["heldout"]["at-right"] == {"states": 16, "positives": 8}
-    few = settings("steps=40", "members=2", "learning_rate=1e-3", *FIXED)
-    run("train-ensemble", data, "--out", folder / "ensemble", "-q", *few)
-    run("evaluate", folder, "-q")
-    members = pd.read_csv(folder / "evaluation" / "tables" / "hypotheses.csv").set_index("quantity")["mean"]
-    assert members["worst"] > 0.9
 
 
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
@@ -197,12 +180,6 @@ def test_what_is_wrong_with_arrays_is_one_line(changes: dict[str, Any], message:
     given = mixed_arrays() | changes if by_key else arrays(**changes)
     with pytest.raises(UserError, match=message):
         assembled(given)
-
-
-def test_keys_are_names_of_files() -> None:
-    named = {name.replace("/state", "/.."): values for name, values in mixed_arrays().items()}
-    with pytest.raises(UserError, match="can be file names"):
-        assembled(named)
 
 
 def test_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:
