@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble, write_ensemble
+from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble
 from hypogoal.hypotheses.networks import as_input
 from hypogoal.hypotheses.stacked import StackedMembers
 
@@ -62,17 +62,6 @@ def config_of(members: int = 3) -> dict[str, object]:
     """Of an artefact."""
     kind = {"network": "doorkey", "view": "full", "observation_shape": SHAPE, "observation_dtype": "uint8"}
     return {"sub_goals": ["goal"], "members": members, **kind}
-
-
-def test_an_ensemble_comes_back_from_its_file(tmp_path: Path) -> None:
-    """Spec A8, G2: through safetensors, bit for bit."""
-    ensemble = ensemble_of()
-    observations = images_of("noise", 6)
-    write_ensemble(tmp_path, "goal", ensemble)
-    back = read_ensemble(tmp_path, config_of(), "goal")
-    assert len(back) == 3
-    assert not back.training
-    np.testing.assert_array_equal(back.predict(observations), ensemble.predict(observations))
 
 
 def test_foreign_weights_are_one_clear_line(tmp_path: Path) -> None:

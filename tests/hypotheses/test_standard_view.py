@@ -68,9 +68,3 @@ def test_attributions_to_numbers_are_complete(shape: tuple[int, ...]) -> None:
     assert found.values.shape == (50, 2, *shape) and found.completeness_error().max() < 1e-9
     mean = np.abs(found.values).mean(0).reshape(2, 4)
     assert (mean.argmax(1) == 2).all() and (mean[:, 3] == 0).all()
-
-
-def test_a_network_for_pictures_is_refused() -> None:
-    """Spec G2."""
-    with pytest.raises(UserError, match=r"'montezuma' does not take these observations: .*mlp takes any"):
-        trained(network="montezuma")
