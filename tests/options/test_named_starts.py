@@ -13,11 +13,9 @@ from toy_data import untrained
 
 import hypogoal
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.config import described
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Domain
-from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.options.tables import Executions
 from hypogoal.stages.train_baseline import train_baseline
 from hypogoal.stages.train_options import train_options
@@ -84,17 +82,6 @@ def test_options_from_a_named_start(corridor: Path, tmp_path: Path) -> None:
     assert last["step"] == 800 and {"reached", "terminated", "duration", "option_loss"} <= set(last)
 
 
-def test_same_seed_same_files(corridor: Path, tmp_path: Path) -> None:
-    """The project's rule: randomness is passed in; kept actions are among it."""
-    every = {"start": "middle", "exploration": "persistent", "n_step": 3, "steps": 240}
-    for name, seed in (("one", 1), ("two", 1), ("other", 2)):
-        train(corridor, tmp_path / name, seed=seed, **every)
-    for path in (tmp_path / "one").iterdir():
-        if path.name != "manifest.json":
-            assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
-    assert (tmp_path / "one/executions.csv").read_bytes() != (tmp_path / "other/executions.csv").read_bytes()
-
-
 def test_a_start_must_be_one_of_the_domains(corridor: Path, tmp_path: Path) -> None:
     """Spec D4, G2: one line that names those there are; nothing is left behind."""
     words = ["train-options", corridor, "--out", tmp_path / "options", "--set", "termination=oracle"]
@@ -109,12 +96,6 @@ def test_a_domain_with_one_start_has_no_names_for_it(tmp_path: Path) -> None:
     ensemble = untrained(tmp_path / "ensemble", doorkey, 1, "mlp")
     with pytest.raises(UserError, match="unknown start: 1L"):
         train_options(ensemble, tmp_path / "options", steps=10, start="1L", quiet=True)
-
-
-def test_the_papers_number_of_steps_is_told() -> None:
-    """Spec D4: ``hypogoal config train-options`` says that the paper's 3e5 steps are those of each option."""
-    (steps,) = [row for row in described(TrainOptionsConfig) if row["name"] == "steps"]
-    assert "3e5 for each option" in steps["source"]
 
 
 @pytest.mark.atari

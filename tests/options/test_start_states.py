@@ -15,7 +15,6 @@ from hypogoal.options.choosers import EvenChooser
 from hypogoal.options.config import OptionConfig
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.networks import PictureEmbedding
 from hypogoal.options.recording import Recorder
 from hypogoal.options.tables import Executions
 
@@ -109,21 +108,6 @@ def test_stops_of_an_engine_that_forgets_are_kept_as_pictures(tmp_path: Path) ->
 def learned(steps: int, engine: LongCorridor | None = None, **settings: object) -> OptionLoop:
     loop = loop_of(engine or LongCorridor(4), **QUICK | BEGIN | {"option_timeout": 10} | settings)
     return played(loop, steps // 4)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"n_step": 3, "exploration": "persistent"}],
-    ids=["one-step", "three-step persistent"],
-)
-def test_the_light_learner_learns_from_pictures(changes: dict) -> None:
-    """Spec D2, D4: own experience, one step and several: both options go straight to their ends."""
-    loop = learned(1600, epsilon_final=0.02, **changes)
-    assert isinstance(loop.learner.networks.online.cells, PictureEmbedding)
-    for option, shortest in ((0, 2), (1, 3)):
-        last = list(loop.recorder.executions[option])[-20:]
-        assert np.mean([row.reached for row in last]) >= 0.9
-        assert np.median([row.duration for row in last]) == shortest
 
 
 def test_values_over_several_steps_are_the_discounted_ones() -> None:
