@@ -114,6 +114,7 @@ ODD: list[tuple[bytes, np.ndarray | None]] = [
     (tiff(DEEP, 16, planes=2), None),
     (tiff(GREY, colours=1, signs=2), None),
     (b"P5 7 9 65535\n" + (GREY * np.uint16(16)).astype(">u2").tobytes(), None),
+    (b"P6 7 9 65535\n" + (COLOURED * np.uint16(16)).astype(">u2").tobytes(), None),
     (deep_png(DEEP >> 4), None),
     (stored(DEEP[..., 0] >> 4, "TIFF"), None),
     (stored(GREY[..., 0].astype(np.float32), "TIFF"), None),

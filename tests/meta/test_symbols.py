@@ -122,18 +122,6 @@ def test_what_an_option_did_elsewhere_tells_what_it_is_worth_here() -> None:
     np.testing.assert_allclose(value, expected, atol=1e-4)
 
 
-def test_symbols_that_do_not_offer_an_option_never_choose_it() -> None:
-    """Masks: places of one, two and three options; the chain's reward lies behind all three."""
-    offered = {"a": [0], "b": [0, 1], "c": [0, 1, 2]}
-    moves = {("a", 0): sure(0, "b"), ("b", 0): sure(0, "b"), ("b", 1): sure(0, "c")}
-    moves |= {("c", option): sure(float(option == 2), OVER) for option in range(3)}
-    world, chooser = World(offered, moves), chooser_of(3)
-    assert np.mean(world.episodes(chooser, 40)[20:]) >= 0.9
-    assert world.episode(frozen(chooser)) == (1.0, [0, 1, 2])
-    qualities = chooser.model.qualities(np.asarray)
-    np.testing.assert_array_equal(np.isfinite(qualities), chooser.model.symbols > 0)
-
-
 def test_a_cut_is_not_the_end_of_the_task() -> None:
     """An episode is cut before a slow option's end three times of four: what follows stays, so it is worth most."""
     moves: dict[Any, Any] = {
