@@ -99,6 +99,7 @@ ODD: list[tuple[bytes, np.ndarray | None]] = [
     (stored(COLOURED, "TIFF", **SEVERAL), COLOURED),
     (stored(DEEP[..., 0]), GREY),
     (stored(GREY[..., 0] > 127, "TIFF"), (GREY > 127) * 255),
+    (stored(GREY[..., 0] > 127), (GREY > 127) * 255),
     (stored(GREY[..., 0], "GIF"), GREY),
     (stored(OPAQUE), COLOURED),
     (stored(OPAQUE, "WEBP", lossless=True), COLOURED),
