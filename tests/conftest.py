@@ -36,7 +36,7 @@ LONGEST = (
     "test_start_states",
     "test_loop",
     "test_docs",
-    "test_notebook",
+    "test_pages",
     "test_package",
 )
 

@@ -132,8 +132,6 @@ class Flipped(CorridorEnv):
 
 
 GREY = GymnasiumDomain(Grey, SUB_GOALS)
-NAMELESS = GymnasiumDomain(CorridorEnv, {"rooms/low": at_left})
-TWICE = GymnasiumDomain(CorridorEnv, {"End": at_left, "end": at_right})
 WORDY, STEERED, RESTLESS = (GymnasiumDomain(env, SUB_GOALS) for env in (Wordy, Steered, Restless))
 SENSED, FRAMED, MIXED = (GymnasiumDomain(env, SUB_GOALS) for env in (Sensed, Framed, Mixed))
 NEVER = GymnasiumDomain(CorridorEnv, {**SUB_GOALS, "on-the-moon": lambda env: False})

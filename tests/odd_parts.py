@@ -33,11 +33,6 @@ class Fractions(First):
         return offered.argmax(1) + 0.4
 
 
-class Column(First):
-    def choose(self, environments: Any, ids: Any, offered: Any) -> Any:
-        return offered.argmax(1)[:, None]
-
-
 class Last(First):
     """Whatever is offered."""
 
@@ -165,11 +160,6 @@ class Counts(TerminationRule):
         return (log_odds > 0).astype(np.int64)
 
 
-class Bare(TerminationRule):
-    def __init__(self, *arguments: Any, **more: Any):
-        pass
-
-
 class Whole(View):
     """All of a picture."""
 
@@ -244,11 +234,6 @@ class AnyState(Whole):
         return [np.arange(len(labels))], 0.5
 
 
-class Mask(Whole):
-    def pools(self, labels: Any, origins: Any) -> Any:
-        return [labels], 0.5
-
-
 class Share(Whole):
     def pools(self, labels: Any, origins: Any) -> Any:
         return [np.flatnonzero(labels)], 5
@@ -268,10 +253,6 @@ def words(observations: Any, labels: Any, unlabelled: Any, members: int, seed: i
     return [["yes"] * len(unlabelled)] * members
 
 
-def truths(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
-    return np.ones((members, len(unlabelled)), np.bool_)
-
-
 def blackens(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
     unlabelled[:] = 0
     return np.ones((members, len(unlabelled)))
@@ -279,7 +260,3 @@ def blackens(observations: Any, labels: Any, unlabelled: Any, members: int, seed
 
 def moody(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:
     return NOBODYS.normal(size=(members, len(unlabelled)))
-
-
-def of_two(observations: Any, labels: Any) -> Any:
-    return None

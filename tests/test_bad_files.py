@@ -1,4 +1,4 @@
-"""Files that are missing, cut off, of another kind, newer or no text: one line, exit code 2, nothing left behind."""
+"""Files that are missing, damaged, of another kind or newer: one line, exit code 2, nothing left behind (Spec G2)."""
 
 import json
 from collections.abc import Callable
@@ -12,6 +12,7 @@ from command_line import fails, refuses, run, settings
 from PIL import Image
 
 from hypogoal.core.artefacts import MANIFEST
+from tests.attacks.fuzz import CHANGES, Sandbox, outcome_of
 
 PICTURE = b"\x89PNG\r\n\x1a\n" + bytes(range(200))
 # File of a run -> the command that reads it.
@@ -117,3 +118,18 @@ def test_a_byte_order_mark_is_read(there: Path, name: str) -> None:
     path = there / name
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     run(*words_for(name, there), *(settings("workers=1") if "preset" in name else []))
+
+
+LAST = {"csv": 13}  # case, else the fifth; the first is 1, since case 0 takes seconds
+
+
+@pytest.fixture
+def box(corridor_run: Path, tmp_path: Path) -> Sandbox:
+    return Sandbox(corridor_run, tmp_path)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_every_case_is_read_or_refused(box: Sandbox, name: str) -> None:
+    """Spec G2: nothing but ``UserError`` of one line, and nothing outside the output is touched."""
+    outcomes = {outcome_of(box, name, case) for case in range(1, LAST.get(name, 5) + 1)}
+    assert "refused" in outcomes and outcomes <= {"accepted", "refused"}

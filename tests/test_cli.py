@@ -8,17 +8,6 @@ from command_line import refuses, run
 from shared_runs import CORRIDOR_RUN, DOORKEY_RUN, command
 
 
-def test_steps_of_both_stages_count(tiny_run: Path) -> None:
-    """Spec A3, A4, F5: train-meta continues; its curve begins with the episodes of train-options."""
-    rows = [line.split(",") for line in (tiny_run / "meta" / "episodes.csv").read_text().splitlines()[1:]]
-    assert int(rows[0][0]) <= 1024 < int(rows[-1][0]) <= 3072 + 8
-    manifest = json.loads((tiny_run / "meta" / "manifest.json").read_text())
-    assert manifest["config"]["options_steps"] == 1024
-    assert {entry["kind"] for entry in manifest["inputs"]} == {"ensemble", "options"}
-    layout = json.loads((tiny_run / "meta" / "layout.json").read_text())
-    assert layout["layout_seed"] == 100 and layout["shortest_path"] >= 9
-
-
 def test_show_and_verify(tiny_run: Path, tmp_path: Path) -> None:
     """Spec A6, A8: what is this, is it whole; what a machine is to read is JSON and nothing else."""
     for part, kind in (("data.h5", "data"), ("ensemble", "ensemble"), ("meta", "meta"), ("", "run")):
@@ -107,13 +96,3 @@ def test_config_lists_every_setting() -> None:
     text = run("config", "train-meta").out
     assert "gae_lambda = 0.95" in text and "paper: 0.97" in text
     assert any(row["name"] == "steps" for row in json.loads(run("config", "train-meta", "--json").out))
-
-
-def test_dry_run_lists_commands_and_runs_none(tmp_path: Path) -> None:
-    """Spec A6: a run is ordinary commands. Spec D5, E4: in the paper's, policies start fresh, a layout per agent."""
-    out = tmp_path / "run"
-    lines = run("run", "doorkey", "--preset", "paper", "--out", out, "--dry-run").out.splitlines()
-    assert sum("train-meta" in line and "chooser" not in line and "termination" not in line for line in lines) == 10
-    assert len({line.split("--layout-seed ")[1].split()[0] for line in lines if "--layout-seed" in line}) == 10
-    assert not any("train-options" in line for line in lines)
-    assert not out.exists()

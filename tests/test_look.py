@@ -85,10 +85,7 @@ def test_what_is_unfinished_is_said(small_run: Path) -> None:
     with create(Path("run/ppo"), kind="baseline", config={}, seed=0) as draft:
         assert run("verify", "run").out.splitlines() == ["run: whole so far", "run/ppo: in progress"]
         assert run("status", "run").out.splitlines()[0] == "run/ppo: in progress"
-        assert run("verify", "run/ppo").out.splitlines() == [
-            "run/ppo: nothing is complete yet",
-            "run/ppo: in progress",
-        ]
+        assert run("verify", "run/ppo").out.splitlines() == ["run/ppo: nothing is complete yet", "run/ppo: in progress"]
     draft.folder.mkdir()
     draft.begun.write_text("{}")
     told = run("verify", "run", "--json").out

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 from command_line import fails, refuses, settings
 from corridor_env import SHAPE, SUB_GOALS, CorridorEnv
-from own_domain import CorridorDomain, TallCorridor
 from torch import Tensor, nn
 
 from hypogoal.core import own_code
 from hypogoal.core.checkpoints import PACE
 from hypogoal.core.errors import NumericalError, UserError
-from hypogoal.domains.base import Step
 from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 
 NAME = f"{__name__}:OWN"
@@ -110,23 +108,6 @@ def test_what_is_raised_has_a_place(place: str, error: BaseException, told: Call
     domain, words = PLACES[place]
     line = told(domain(raising(error)), words, f"your code raised {type(error).__name__}: ")
     assert f": test_own_code.py, line {LINE}. --debug shows" in line and "and where" not in line
-
-
-def own_engine(change: Callable[[Step], Any]) -> CorridorDomain:
-    class Engine(TallCorridor):
-        def step(self, actions: np.ndarray) -> Step:
-            return change(super().step(actions))  # type: ignore[no-any-return]
-
-    class Domain(CorridorDomain):
-        def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> Any:
-            return Engine(count, max_steps)
-
-    return Domain()
-
-
-def test_engines_without_gymnasium_too(told: Callable[..., str]) -> None:
-    """Spec B6, G2."""
-    told(own_engine(raising(ZeroDivisionError())), BASELINE, "your code raised ZeroDivisionError")
 
 
 def test_objectives(told: Callable[..., str], data: Path) -> None:

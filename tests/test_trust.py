@@ -138,13 +138,3 @@ def test_cells_have_what_one_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "own.toml").write_text(EXPERIMENT.format(own="dbat", command=command))
     run("run", "own.toml", "--out", "out", "-q", "--set", "own=margin:pair_loss")
     assert len([*tmp_path.glob("out/c/*/manifest.json")]) == 1
-
-
-def test_cells_have_no_more_than_what_one_typed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Code of one's own in a run does not open the door to what other files name."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(folder)]))
-    (folder / "margin.py").write_text((ROOT / "examples" / "margin.py").read_text())
-    command = "train-ensemble theirs.h5 --diversity {own} --set steps=2"
-    (folder / "own.toml").write_text(EXPERIMENT.format(own="dbat", command=command))
-    fails(*["run", "own.toml", "--out", "out", "-q", "--set", "own=margin:pair_loss"])
-    assert not (folder / "ran").exists()

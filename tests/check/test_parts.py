@@ -26,7 +26,6 @@ def test_what_may_surprise_is_a_warning() -> None:
 BROKEN = [
     ("--chooser", "Abstract", "plays: this chooser lacks choose"),
     ("--chooser", "Fractions", "plays: choose gave float64 (4,): Fractions. Give int64 (4,), from 0 to 3."),
-    ("--chooser", "Column", "plays: choose gave int64 (4, 1)"),
     ("--chooser", "Last", "of which not all are offered: Last. Choose where 'offered' is true."),
     ("--chooser", "Beyond", "plays: choose gave 4 to 4"),
     ("--chooser", "Forgetful", "plays: learn gave None: Forgetful. Return a dict"),
@@ -36,7 +35,6 @@ BROKEN = [
     ("--learner", "Negative", "plays: greedy gave -1 to -1: Negative. Give int64 (4,), from 0 to 6."),
     ("--learner", "Unsaved", "is kept: table is another one when loaded"),
     ("--termination", "Counts", "plays: reached gave int64 (4,)"),
-    ("--termination", "Bare", "object has no attribute 'options': odd_parts.py, class Bare"),
     ("--view", "Unready", "object has no attribute 'shape': odd_parts.py, class Unready"),
     ("--view", "Few", "takes 2 positional arguments but 3 were given: Few.__init__"),
     ("--view", "OneRow", "trains: the view shows uint8 (1, 48, 48, 3) of 2 states"),
@@ -47,14 +45,11 @@ BROKEN = [
     ("--view", "Bright", "trains: the view changes a batch to float32 (16, 48, 48, 3), at most 2"),
     ("--view", "Always", "shows: without a generator a batch is not what members see"),
     ("--view", "AnyState", "trains: the view gave 1 pools and the share 0.5"),
-    ("--view", "Mask", "trains: the view gave 1 pools"),
     ("--view", "Share", "trains: the view gave 1 pools and the share 5"),
     ("--teacher", "turned", "trains: the teacher gave scores float64 (2048, 2)"),
     ("--teacher", "words", "trains: the teacher gave no scores (could not convert string to float: "),
-    ("--teacher", "truths", "trains: the teacher gave scores bool (2, 2048)"),
     ("--teacher", "blackens", "trains: the teacher changes what it gets"),
     ("--teacher", "moody", "differs when trained again"),
-    ("--teacher", "of_two", "takes 2 positional arguments but 5 were given: of_two"),
     ("--teacher", "nobody", "trains: the teacher cannot be loaded"),
 ]
 

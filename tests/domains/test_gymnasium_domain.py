@@ -138,22 +138,6 @@ def test_a_domain_says_what_is_a_success() -> None:
     assert DOMAIN.make_engine(0, 1, 8).step(np.array([0])).succeeded is None
 
 
-def test_an_engine_goes_on_from_a_snapshot() -> None:
-    """Spec G1: the same ids, pictures and ends as the one that was not stopped."""
-    one, rng = engine_of(), np.random.default_rng(2)
-    actions = rng.integers(2, size=(40, 3))
-    for row in actions[:23]:
-        one.step(row)
-    other = engine_of()
-    other.restore(one.snapshot())
-    for row in actions[23:]:
-        for left, right in zip(one.step(row), other.step(row), strict=True):
-            np.testing.assert_array_equal(left, right)
-    known = np.arange(one.n_states)
-    np.testing.assert_array_equal(one.images(known), other.images(known))
-    np.testing.assert_array_equal(one.labels(known), other.labels(known))
-
-
 def test_an_environment_that_does_not_repeat_itself_is_not_gone_on_with() -> None:
     """Spec G1: what cannot be resumed says so."""
     engine, other = (corridor_env.RESTLESS.make_engine(0, 4, 30) for _ in range(2))

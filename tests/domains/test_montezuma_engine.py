@@ -9,22 +9,11 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Engine
 from hypogoal.domains.montezuma import env as montezuma_env
 from hypogoal.domains.montezuma.domain import DOMAIN
-from hypogoal.domains.montezuma.emulator import (
-    DOWN,
-    N_ACTIONS,
-    NOOP,
-    OBSERVATION_SHAPE,
-    RIGHT,
-    UP,
-    Emulator,
-    stacked,
-)
+from hypogoal.domains.montezuma.emulator import DOWN, N_ACTIONS, NOOP, OBSERVATION_SHAPE, RIGHT, UP, Emulator, stacked
 from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, MontezumaLadder, arrives, make_starts
-from hypogoal.domains.montezuma.ladders import BASES, distance_to
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 
 pytestmark = pytest.mark.atari
@@ -91,24 +80,6 @@ def test_gymnasium_accepts_it() -> None:
     check_env(env)
 
 
-def test_an_episode_of_the_environment(env: MontezumaLadder) -> None:
-    """Spec B4: from the top to the base nine steps of DOWN; ``info`` says where the agent is and what it reached."""
-    image, info = env.reset(seed=1)
-    assert (info["position"], info["alive"]) == ((1, 21, 192), True)
-    assert np.array_equal(image, env.emulator.stack)
-    for step in range(9):
-        assert not info["labels"][CLIMB_DOWN.name]
-        image, reward, terminated, truncated, info = env.step(DOWN)
-        assert (reward, terminated, truncated) == (0.0, False, False), step
-    assert (info["position"], info["alive"]) == ((1, 21, 148), True)
-    assert info["labels"][CLIMB_DOWN.name]
-    steps = 9
-    while info["alive"] and not truncated:
-        *_, truncated, info = env.step(NOOP)
-        steps += 1
-    assert truncated == (steps == 60)
-
-
 def test_start_states_are_drawn_or_asked_for(env: MontezumaLadder) -> None:
     """Spec D4: reset with a seed repeats, without draws all of them, and one can be asked for by number."""
     looks = {stacked(start.seen).tobytes(): number for number, start in enumerate(env.starts)}
@@ -153,35 +124,6 @@ def test_engine_is_exact_to_the_environment(engine: MontezumaEngine, env: Montez
             assert engine.ids[0] == now[0]
             assert engine.elapsed[0] == env.elapsed
     assert min(seen.values()) >= 2, seen
-
-
-def test_ids_images_and_positions(engine: MontezumaEngine) -> None:
-    """Start states have the first ids for ever; every step of every environment makes a new one, with its own image."""
-    contract: Engine = engine
-    assert contract.n_actions == 18
-    assert contract.observation_shape == OBSERVATION_SHAPE
-    assert set(engine.reset()) <= set(range(STARTS))
-    starts = engine.images(np.arange(STARTS))
-    assert np.array_equal(starts, np.stack([stacked(start.seen) for start in engine.starts]))
-    assert engine.positions(np.arange(STARTS)).tolist() == [[1, 21, 192]] * STARTS
-    before, first = engine.ids, engine.n_states
-    shown = [engine.images(before)]
-    rng = np.random.default_rng(0)
-    for number in range(12):
-        step = engine.step(rng.choice([DOWN, UP], size=2))
-        assert step.next_ids.tolist() == [first + 2 * number, first + 2 * number + 1]
-        assert step.rewards.dtype == np.float32
-        assert engine.n_states == first + 2 * number + 2
-        shown.append(engine.images(step.next_ids))
-        assert np.array_equal(shown[-1][..., :3], shown[-2][..., 1:])  # one new frame each
-    ids = np.arange(first, engine.n_states)
-    assert np.array_equal(engine.images(ids), np.concatenate(shown[1:]))
-    out = engine.images(np.array([first + 3, 0]))
-    assert np.array_equal(out, np.stack([shown[2][1], starts[0]]))
-    positions = engine.positions(ids)
-    assert (positions[:, :2] == (1, 21)).all()
-    assert (distance_to(positions, BASES) == np.abs(positions[:, 2] - 148)).all()
-    assert engine.images(np.zeros(0, np.int64)).shape == (0, *OBSERVATION_SHAPE)
 
 
 def test_old_states_are_forgotten() -> None:

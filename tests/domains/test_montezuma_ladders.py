@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hypogoal.domains.montezuma.emulator import (
-    DOWN,
-    FIRST_ROOM_OF_ROW,
-    LEFT,
-    RIGHT,
-    ROOMS,
-    Emulator,
-    row_of,
-)
+from hypogoal.domains.montezuma.emulator import DOWN, FIRST_ROOM_OF_ROW, LEFT, RIGHT, ROOMS, Emulator, row_of
 from hypogoal.domains.montezuma.ladders import (
     BASES,
     LADDERS,

@@ -1,5 +1,8 @@
-"""Observations that are no pictures, in domains made from Gymnasium environments (Spec B6)."""
+"""What observations are taken for, and numbers in domains made from Gymnasium environments (Spec B6)."""
 
+import re
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +24,10 @@ from hypogoal.data import open_dataset, write_dataset
 from hypogoal.domains.gymnasium.domain import GymnasiumConfig, GymnasiumDomain
 from hypogoal.domains.gymnasium.reader import reader_of
 from hypogoal.hypotheses.ensemble import read_ensemble
+from hypogoal.importing.states import take
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup, make_engine, of_ensemble
-from hypogoal.observations import DEVIATIONS, NUMBERS, standard_of, standardised
+from hypogoal.observations import DEVIATIONS, NUMBERS, PICTURE, standard_of, standardised
 
 NAMES = (*(f"layout[{number}]" for number in range(8)), "noise", "place[0]", "place[1]")
 SMALL = GymnasiumConfig(heldout_seeds=(4, 5), steps=80)
@@ -122,26 +126,18 @@ class Sensor(corridor_env.CorridorEnv):
     """Its reading at the last cell but one is lost."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)  # type: ignore[assignment]
-    far = 0.0
 
     def image(self) -> Any:
-        return np.array([np.nan if self.cell == 4 and not self.far else self.cell / 5 + self.far, self.layout])
-
-
-class Surveyed(Sensor):
-    """In metres of a map."""
-
-    far = 4_250_000.0
+        return np.array([np.nan if self.cell == 4 else self.cell / 5, self.layout])
 
 
 def test_what_cannot_be_read_is_refused_by_check_and_collect() -> None:
     """Spec G2: with its place; nothing is said of seeds."""
-    for env, fault in ((Sensor, "not finite in float32: x0"), (Surveyed, "float32 makes equal: x0")):
-        domain = GymnasiumDomain(env, corridor_env.SUB_GOALS)
-        with pytest.raises(UserError, match=rf"{fault}.* at layout_seed, episode, step \(0, \d+, \d+\)"):
-            domain.collect(SMALL, 0, Progress("collect", 1, quiet=True))
-        *_, last = check_domain(domain, SMALL)
-        assert not last.ok and fault in last.text
+    domain, fault = GymnasiumDomain(Sensor, corridor_env.SUB_GOALS), "not finite in float32: x0"
+    with pytest.raises(UserError, match=rf"{fault}.* at layout_seed, episode, step \(0, \d+, \d+\)"):
+        domain.collect(SMALL, 0, Progress("collect", 1, quiet=True))
+    *_, last = check_domain(domain, SMALL)
+    assert not last.ok and fault in last.text
 
 
 def test_a_picture_alone_in_a_dictionary_is_that_picture() -> None:
@@ -206,3 +202,104 @@ def test_baselines_see_numbers_standardised_where_a_standard_is_known() -> None:
     np.testing.assert_array_equal(EngineEnv(engine).reset(), numbers)
     engine.standard = np.full(11, 2.0, NUMBERS), np.full(11, 4.0, NUMBERS)
     np.testing.assert_allclose(EngineEnv(engine).reset(), (numbers - 2) / 4)
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "own-domain.md"
+TABLE = re.search(r"^\| one observation .*?(?=\n\n)", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+assert TABLE
+ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TABLE[0].splitlines()[2:]]
+CASES = [
+    pytest.param(dtype, tuple(map(int, filter(None, shape.split(",")))), outcome, id=f"{dtype}({shape})")
+    for _, examples, outcome in ROWS
+    for dtype, shape in re.findall(r"`(\w+) \(([\d, ]+)\)`", examples)
+]
+
+
+DTYPES = ("uint8", "int64", "uint16", "bool", "float16", "float32", "float64")
+
+
+def outcome_of(shape: tuple[int, ...], dtype: str) -> str:
+    """What such an observation is taken for: ``picture``, ``numbers``, or ``refused``.
+
+    An ``AssertionError`` where environment and array differ, or it was guessed.
+    """
+    state = np.ones(shape, dtype)
+    env = Says(spaces.Box(0, 1, shape, state.dtype.type), state)
+    wide = any(min(pair) > 16 for pair in pairwise(shape))  # the shape of a picture
+    of_env, of_array = _refusal(lambda: reader_of(env.observation_space)), _refusal(lambda: take(state, "the state"))
+    assert bool(of_env) == bool(of_array), (of_env, of_array)
+    if of_env:
+        assert dtype == "uint8" or wide, of_env
+        return "refused"
+    look, (taken, _) = reader_of(env.observation_space), take(state, "the state")
+    assert taken.shape == look.shape and (taken.dtype == look.dtype or look.dtype != PICTURE)
+    np.testing.assert_array_equal(look.read(env.reset()[0]), taken)
+    if look.dtype == PICTURE:
+        assert dtype == "uint8" and len(shape) in (2, 3)
+        return "picture"
+    assert not wide
+    return "numbers"
+
+
+def _refusal(call: Callable[[], object]) -> str:
+    """The line with which a call refuses; empty where it does not."""
+    try:
+        call()
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(("dtype", "shape", "outcome"), CASES)
+def test_the_table_of_the_page_is_true(dtype: str, shape: tuple[int, ...], outcome: str) -> None:
+    """Spec B6: each of its examples, in an environment and in an array."""
+    words = {"picture": "a picture"}
+    found = outcome_of(shape, dtype)
+    assert words.get(found, found) == outcome.removesuffix(", `(H, W, 1)`")
+    if outcome.endswith("`(H, W, 1)`"):
+        assert take(np.ones(shape, dtype), "the state")[0].shape == (*shape, 1)
+
+
+def test_the_table_has_all_types_and_every_outcome() -> None:
+    assert {case.values[0] for case in CASES} >= set(DTYPES)
+    assert {case.values[2] for case in CASES} == {
+        "a picture", "a picture, `(H, W, 1)`", "numbers", "refused",
+    }  # fmt: skip
+
+
+def test_frames_and_colours_are_stacked_in_their_order() -> None:
+    """Spec B6: wherever they stood, by --stack."""
+    whole = np.random.default_rng(0).integers(0, 255, (2, 40, 48, 4, 3), dtype=np.uint8)  # frames, then colours
+    wanted = whole.reshape(2, 40, 48, 12)
+    for axes in ((2, 0, 1, 3), (2, 3, 0, 1), (0, 1, 3, 2), (3, 0, 1, 2), (3, 2, 0, 1), (0, 1, 2, 3)):
+        states = whole.transpose(0, *(axis + 1 for axis in axes))
+        with pytest.raises(UserError, match=r"stacks of pictures: .*Give pictures as uint8 .* 'import --stack' puts"):
+            take(states[0], "the state")
+        np.testing.assert_array_equal([take(state, "the state", stack=True)[0] for state in states], wanted)
+
+
+def test_minigrids_dictionary_is_read_without_its_text() -> None:
+    """Spec B6: a picture and a number by key; a line says so."""
+    env = gymnasium.make("minigrid:MiniGrid-Empty-8x8-v0")
+    with pytest.warns(UserWarning, match="observations are read without their text: mission"):
+        reader = reader_of(env.observation_space)
+    seen, _ = env.reset(seed=0)
+    read = reader.read(seen)
+    assert read.dtype.names == ("direction", "image")
+    np.testing.assert_array_equal(read["image"], seen["image"])
+    assert read["direction"].tolist() == [1.0, 0.0, 0.0, 0.0]
+    nothing_else = spaces.Dict(mission=env.observation_space["mission"])
+    with pytest.raises(UserError, match="observations must be images"):
+        reader_of(nothing_else)
+
+
+def test_a_dictionary_hides_no_picture() -> None:
+    """Spec B6: stacks, floats and integers in the shape of pictures are no more guessed in there than alone."""
+    speed = spaces.Box(0, 1, (2,))
+    for shape, dtype in (((4, 48, 48, 3), np.uint8), ((48, 48), np.int64), ((48, 48, 3), np.float32)):
+        space = spaces.Dict(a=speed, b=spaces.Box(0, 1, shape, dtype))
+        with pytest.raises(UserError, match=r"observations .*: b (u?int|float).* Give pictures as uint8 \(H"):
+            reader_of(Says(space, None).observation_space)
+        alone = Says(spaces.Dict(b=space["b"]), {"b": np.ones(shape, dtype)})
+        with pytest.raises(UserError, match=r"observations .*: b (u?int|float)"):
+            reader_of(alone.observation_space)

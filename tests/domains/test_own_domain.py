@@ -5,7 +5,7 @@ from pathlib import Path
 
 import corridor_env
 import pytest
-from command_line import refuses, run, settings
+from command_line import run, settings
 
 import hypogoal
 from hypogoal.core.errors import UserError
@@ -31,18 +31,6 @@ def test_what_is_no_domain_is_refused() -> None:
         load_domain("own_domain:CorridorConfig")
     with pytest.raises(UserError, match="cannot be loaded"):
         load_domain("own_domain:NOTHING")
-
-
-@pytest.mark.parametrize(
-    ("domain", "message"),
-    [
-        ("NAMELESS", "different names that are usable as file names: "),
-        ("TWICE", "different names that are usable as file names: End, end"),
-    ],
-)
-def test_what_is_wrong_with_an_own_domain_is_one_line(domain: str, message: str, tmp_path: Path) -> None:
-    """Spec B6, G2: at once, not when all is played."""
-    refuses(message, "collect", f"corridor_env:{domain}", "--out", tmp_path / "data.h5", "-q")
 
 
 def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path) -> None:

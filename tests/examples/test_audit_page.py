@@ -32,28 +32,20 @@ class Network(torch.nn.Module):
         return 10 * pictures[:, 0, 0, {column}] - 5
 network = Network()
 """
-# The shape of LeRobot's published reward classifier: one frozen encoder, behind it layers for each camera, a binary
-# head of all cameras; ``predict`` takes a list of cameras and gives logits and probabilities (N,).
+# As LeRobot's published reward classifier is used: ``predict`` takes a list of cameras and gives logits and
+# probabilities (N,) that need a gradient.
 CLASSIFIER = """
 from types import SimpleNamespace
 import torch
 from torch import nn
-class Embedding(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.kernel = nn.Parameter(torch.randn(8, 4, 4, 2))
-    def forward(self, features):
-        return (features[..., None] * self.kernel).sum((2, 3)).flatten(1)
 class Classifier(nn.Module):
     def __init__(self, keys):
         super().__init__()
-        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 5, 4), nn.ReLU(), nn.AdaptiveAvgPool2d(4)).requires_grad_(False)
-        layers = lambda: (Embedding(), nn.Dropout(0.1), nn.Linear(16, 12), nn.LayerNorm(12), nn.Tanh())
-        self.encoders = nn.ModuleDict({key: nn.Sequential(self.encoder, *layers()) for key in keys})
-        self.head = nn.Sequential(nn.Linear(24, 8), nn.Dropout(0.1), nn.LayerNorm(8), nn.ReLU(), nn.Linear(8, 1))
+        layers = lambda: nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Dropout(0.1), nn.Linear(48, 12))
+        self.encoders = nn.ModuleDict({key: layers() for key in keys})
+        self.head = nn.Linear(24, 1)
     def predict(self, cameras):
-        with torch.no_grad():
-            encoded = [self.encoders[key](camera) for key, camera in zip(self.encoders, cameras, strict=True)]
+        encoded = [encoder(camera) for encoder, camera in zip(self.encoders.values(), cameras, strict=True)]
         logits = self.head(torch.hstack(encoded)).squeeze(-1)
         return SimpleNamespace(logits=logits, probabilities=torch.sigmoid(logits), hidden_states=encoded)
 torch.manual_seed(0)

@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 import torch
 from command_line import settings
-from corridor import Corridor
 from option_loops import loop_of, played
 from torch import Tensor
 
@@ -19,7 +18,6 @@ from examples.distilled import Learner
 from hypogoal.cli import main
 from hypogoal.core.arrays import Ints
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.core.tensors import load_tensors
 from hypogoal.domains.base import Layouts
@@ -28,7 +26,6 @@ from hypogoal.evaluation.choosing import qualities
 from hypogoal.meta.config import TrainOptionsConfig
 from hypogoal.meta.episodes import agent_of
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.termination import oracle_terminations
 
 GOALS = 5
 GRID = "examples.distilled:Grid"
@@ -87,14 +84,6 @@ def test_it_goes_on_where_it_was() -> None:
     played(resumed, 12)
     for name, value in whole.learner.state().items():
         assert torch.equal(value, resumed.learner.state()[name]), name
-
-
-def test_it_needs_a_model() -> None:
-    """One line of what, where and what to do."""
-    engine = Corridor(2)
-    config = TrainOptionsConfig.of(network="examples.distilled:Learner")
-    with pytest.raises(UserError, match=r"does not know what each action leads to: network=examples.distilled:Learner"):
-        Learner(engine, oracle_terminations(engine, (0,)), config, seed=0)
 
 
 @pytest.mark.filterwarnings("ignore:a masked option runs")

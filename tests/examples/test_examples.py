@@ -52,7 +52,7 @@ def test_unlock_pickup_goes_through_all_stages_as_the_page_says(
     """Spec B6, A1-A5: an environment, two label functions and a way to wander, under 30 lines, are all one writes.
 
     The page's commands in their order, but for ``check`` of the domain, which the next test does, and those in
-    FourRooms, which ``test_own_domain_page`` runs in small.
+    FourRooms, which ``library/test_pages.py`` runs in small.
     """
     page = EXAMPLES.parent / "docs" / "own-domain.md"
     example = EXAMPLES / "unlock_pickup.py"

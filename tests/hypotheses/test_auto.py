@@ -14,7 +14,6 @@ from test_training import assert_same, follows, toy, toy_states
 import hypogoal
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.core.errors import UserError
 from hypogoal.hypotheses import auto
 from hypogoal.hypotheses.auto import WEIGHTS, AutoTraining, held_out, information_of, lowest_kept
 from hypogoal.hypotheses.config import TrainEnsembleConfig
@@ -181,12 +180,6 @@ def test_the_share_is_what_a_member_without_diversity_predicts() -> None:
     assert at_once.share == pytest.approx(0.5, abs=0.1)
     assert trained(AUTO.model_copy(update={"diversity": "divdis", "share": 0.2, "steps": 2})).share == 0.2
     assert trained(AUTO.model_copy(update={"diversity": "divdis", "share": "labels", "steps": 2})).share == "labels"
-
-
-def test_nothing_is_searched_without_unlabelled_states() -> None:
-    observations, labels, unlabelled = toy()
-    with pytest.raises(UserError, match="unlabelled states are needed to make members differ"):
-        AutoTraining(observations, labels, unlabelled[:0], AUTO, 0)
 
 
 def test_members_that_are_no_hypotheses_are_named() -> None:

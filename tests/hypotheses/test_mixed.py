@@ -99,7 +99,7 @@ def test_attributions_are_by_key_and_complete(mixed_run: Path) -> None:
 
 
 def test_evaluation_and_report(mixed_run: Path, tmp_path: Path) -> None:
-    """Spec A5, F1, F2: scores, and bars of numbers and of whole pictures."""
+    """Spec A2, A5, F1, F2: hypotheses are trained; scores, and bars of numbers and of whole pictures."""
     made = shutil.copytree(mixed_run, tmp_path / "run")
     run("evaluate", made, "-q")
     members = pd.read_csv(made / "evaluation" / "tables" / "hypotheses.csv").set_index("quantity")["mean"]

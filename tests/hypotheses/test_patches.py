@@ -82,22 +82,6 @@ def compare(plain: nn.Sequential, expected: torch.Tensor, tabled: nn.Sequential,
         torch.testing.assert_close(two, one, rtol=1e-5, atol=1e-7)
 
 
-def test_tables_by_hand() -> None:
-    """Two 3x3 images of two colours, windows of 2x2: four distinct windows at 8 places."""
-    ink = np.array([[[1, 1, 1], [1, 1, 1], [1, 1, 0]], [[1, 1, 1], [1, 1, 1], [1, 1, 1]]], dtype=np.uint8)
-    tables = patches._tables(ink[..., None] * 255, [(2, 1)])
-    colour_of = tables.colours[:, 0].tolist()
-    assert sorted(colour_of) == [0.0, 1.0]
-    (level,) = tables.levels
-    ids = level.rows[level.lines]
-    windows = [[colour_of[part] for part in level.parts[patch]] for patch in ids.reshape(-1)]
-    assert windows == [[1.0] * 4] * 3 + [[1.0, 1.0, 1.0, 0.0]] + [[1.0] * 4] * 4
-    assert len(level.parts) == 2
-    batch = patches.take(tables, np.array([0]))
-    (((share, places),),) = batch.shares
-    assert sorted(share[0].tolist()) == [0.25, 0.75] and places == 4
-
-
 def test_only_what_repeats_is_tabled() -> None:
     """Noise and photographs take the plain way; so do layers that tables do not know."""
     network = build_network("doorkey", (48, 48, 3), torch.Generator())

@@ -1,36 +1,21 @@
-"""NumPy arrays become a data file; what is wrong with them is one line (Spec B3, B6, G2)."""
+"""NumPy arrays and tables of labels become a data file; what is wrong with them is one line (Spec B3, B6, G2)."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import FIXED, refuses, run, settings
+from command_line import refuses, run
 
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
 from hypogoal.importing.assemble import held_out
+from hypogoal.observations import digest
 from tests.importing.states import arrays, assembled, pictures
-from tests.mixed import FRONT, STATE
+from tests.mixed import FRONT, GOAL, STATE
 from tests.mixed import arrays as mixed_arrays
-
-
-def test_arrays_go_through_training_and_evaluation(tmp_path: Path) -> None:
-    """Spec B6, A2, A5: a .npz becomes a data file, an ensemble of it judges the held-out states."""
-    np.savez(tmp_path / "own.npz", **arrays())
-    folder = tmp_path / "run"
-    data = folder / "data.h5"
-    said = run("import", tmp_path / "own.npz", "--out", data, "--sub-goal", "at-right")
-    assert said.out.startswith("states: uint8 (48, 48, 3)\n") and not said.err
-    found = open_dataset(data)
-    np.testing.assert_array_equal(found.labelled("at-right").observations, arrays()["observations"])
-    assert found.counts()["heldout"]["at-right"] == {"states": 16, "positives": 8}
-    few = settings("steps=40", "members=2", "learning_rate=1e-3", *FIXED)
-    run("train-ensemble", data, "--out", folder / "ensemble", "-q", *few)
-    run("evaluate", folder, "-q")
-    members = pd.read_csv(folder / "evaluation" / "tables" / "hypotheses.csv").set_index("quantity")["mean"]
-    assert members["worst"] > 0.9
 
 
 def test_several_sub_goals_come_out_as_they_went_in(tmp_path: Path) -> None:
@@ -199,12 +184,6 @@ def test_what_is_wrong_with_arrays_is_one_line(changes: dict[str, Any], message:
         assembled(given)
 
 
-def test_keys_are_names_of_files() -> None:
-    named = {name.replace("/state", "/.."): values for name, values in mixed_arrays().items()}
-    with pytest.raises(UserError, match="can be file names"):
-        assembled(named)
-
-
 def test_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:
     """Spec G2: no zip file, a damaged one, a pickle, a pointer of Git LFS, none at all; nothing is written."""
     file, out = tmp_path / "own.npz", tmp_path / "data.h5"
@@ -233,3 +212,43 @@ def test_files_that_numpy_does_not_write_are_one_line(tmp_path: Path) -> None:
         refuses(said, "import", file, "--out", out)
     refuses("no such file or folder", "import", tmp_path / "nowhere.npz", "--out", out)
     refuses("arrays and pictures have --sub-goal NAME", "import", pickle, "--out", out, "--label", "a=rewards")
+
+
+@pytest.fixture
+def data(mixed_run: Path) -> Path:
+    return mixed_run / "data.h5"
+
+
+def table(data: Path, count: int) -> str:
+    """The first states labelled, 0 and 1 in turn."""
+    states = open_dataset(data).unlabelled()
+    rows = [f"{row},{digest(state).hex()},{row % 2 if row < count else ''}" for row, state in enumerate(states)]
+    return "\n".join(["row,digest,label", *rows, ""])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text.replace(",", ";"), "cannot be read (ValueError: Usecols do not match columns"),
+        (lambda text: text.replace("row,digest", "row,sum"), "whose first line names label, digest"),
+        (lambda text: text + text.splitlines()[1] + "\n", "Give states of these data, each once"),
+        (lambda text: re.sub(r"(?m)^0,....", "0,0000", text), "audit an ensemble of these data again"),
+        (lambda text: text.replace(",1\n", ",yes\n"), "cannot be read (KeyError: 'yes')"),
+        (lambda _: "", "cannot be read"),
+    ],
+)
+def test_a_table_of_other_states_is_one_line(data: Path, tmp_path: Path, change, said: str) -> None:
+    (tmp_path / "table.csv").write_text(change(table(data, 8)))
+    refuses(said, "import", data, "--label", f"{GOAL}={tmp_path / 'table.csv'}", "--out", tmp_path / "more.h5", "-q")
+
+
+def test_a_table_saved_by_a_spreadsheet_is_read(data: Path, tmp_path: Path) -> None:
+    marks = tmp_path / "table.csv"
+    marks.write_bytes(table(data, 4).replace("\n", "\r\n").encode("utf-8-sig"))
+    run("import", data, "--label", f"{GOAL}={marks}", "--out", tmp_path / "more.h5", "-q")
+    before, after = open_dataset(data), open_dataset(tmp_path / "more.h5")
+    np.testing.assert_array_equal(after.unlabelled(), before.unlabelled()[4:])
+    states = after.labelled(GOAL)
+    np.testing.assert_array_equal(states.observations[-4:], before.unlabelled()[:4])
+    assert states.labels[-4:].tolist() == [False, True, False, True]
+    refuses("labels data of one sub-goal", "import", data, "--label", f"shut={marks}", "--out", tmp_path / "x.h5")

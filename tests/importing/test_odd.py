@@ -43,6 +43,24 @@ def deep_png(values: np.ndarray) -> bytes:
     return written
 
 
+def tiff(values: np.ndarray, depth: int = 8, colours: int = 2, planes: int = 1, signs: int = 1) -> bytes:
+    """A TIFF of one strip a plane, which Pillow writes of some kinds only; the rest are numbers of its standard."""
+    height, width, channels = values.shape
+    whole = values.astype(np.uint8 if depth == 8 else "<u2")
+    parts = [whole.tobytes()] if planes == 1 else [whole[..., channel].tobytes() for channel in range(channels)]
+    places = [8 + len(parts[0]) * number for number in range(len(parts))]
+    tags = {
+        256: [width], 257: [height], 258: [depth] * channels, 259: [1], 262: [colours], 273: places, 277: [channels],
+        278: [height], 279: [len(part) for part in parts], 284: [planes], 339: [signs] * channels,
+    }  # fmt: skip
+    body, listed = b"".join(parts), b""
+    for tag, value in tags.items():
+        word = value[0] if len(value) == 1 else 8 + len(body)
+        body += struct.pack(f"<{len(value)}I", *value) if len(value) > 1 else b""
+        listed += struct.pack("<HHII", tag, 4, len(value), word)
+    return struct.pack("<2sHI", b"II", 42, 8 + len(body)) + body + struct.pack("<H", len(tags)) + listed + bytes(4)
+
+
 def stored(image: np.ndarray | Image.Image, kind: str = "PNG", **more: Any) -> bytes:
     if isinstance(image, np.ndarray):
         image = Image.fromarray(np.ascontiguousarray(image))
@@ -81,10 +99,23 @@ ODD: list[tuple[bytes, np.ndarray | None]] = [
     (stored(COLOURED, "TIFF", **SEVERAL), COLOURED),
     (stored(DEEP[..., 0]), GREY),
     (stored(GREY[..., 0] > 127, "TIFF"), (GREY > 127) * 255),
+    (stored(GREY[..., 0] > 127), (GREY > 127) * 255),
     (stored(GREY[..., 0], "GIF"), GREY),
     (stored(OPAQUE), COLOURED),
     (stored(OPAQUE, "WEBP", lossless=True), COLOURED),
-    # What must be refused: 12 bits of 16, 32 bits, transparent pixels, a cut file.
+    (tiff(COLOURED), COLOURED),
+    (tiff(COLOURED, planes=2), COLOURED),
+    (tiff(255 - GREY, colours=0), GREY),
+    (tiff(GREY * np.uint16(257), 16, 1), GREY),
+    (b"P5 7 9 85\n" + (GREY // 3).tobytes(), GREY // 3 * 3),
+    (b"P5 7 9 65535\n" + (GREY * np.uint16(257)).astype(">u2").tobytes(), GREY),
+    # What must be refused: 12 bits, 12 of 16, 0 as white in 16, planes of 16, signs, 32 bits, clear pixels, a cut file.
+    (tiff(GREY, 12, 1), None),
+    (tiff(GREY * np.uint16(257), 16, 0), None),
+    (tiff(DEEP, 16, planes=2), None),
+    (tiff(GREY, colours=1, signs=2), None),
+    (b"P5 7 9 65535\n" + (GREY * np.uint16(16)).astype(">u2").tobytes(), None),
+    (b"P6 7 9 65535\n" + (COLOURED * np.uint16(16)).astype(">u2").tobytes(), None),
     (deep_png(DEEP >> 4), None),
     (stored(DEEP[..., 0] >> 4, "TIFF"), None),
     (stored(GREY[..., 0].astype(np.float32), "TIFF"), None),

@@ -187,6 +187,13 @@ def filtered(file: h5py.File) -> None:
     data.write_direct_chunk((0, 0), b"0" * 40)
 
 
+def unwritten(file: h5py.File) -> None:
+    """A chunk that was never written, for which HDF5 gives zeros."""
+    del file["data/demo_0/obs/state"]
+    data = file.create_dataset("data/demo_0/obs/state", (5, 2), "f8", chunks=(2, 2))
+    data[:2] = 1.0
+
+
 def put(name: str, values: Any) -> Callable[[h5py.File], object]:
     def change(file: h5py.File) -> None:
         if name in file:
@@ -215,6 +222,7 @@ CHANGES: list[tuple[Callable[[h5py.File], object], str, str]] = [
     ),
     (put("data/demo_0/rewards", np.ones(9)), "", "a number for each frame: rewards, not in demo_0[0]"),
     (put("data/demo_0/rewards", np.ones(1)), "", "a number for each frame: rewards, not in demo_0[1]"),
+    (unwritten, "", "lacks values, for which HDF5 would give others"),
     (filtered, "", "this is compressed by a filter of HDF5 that is not installed"),
 ]
 

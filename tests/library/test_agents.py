@@ -108,6 +108,9 @@ def test_options_do_what_their_members_say(options: Options) -> None:
         assert info["option"] == f"{'right' if right else 'left'}-end/{option % MEMBERS}"
         expected = [True, True, False, False] if right else [False, False, True, True]
         assert env.action_masks().tolist() == expected
+    env = hypogoal.OptionEnv(corridor(), options, gamma=0.5)
+    env.reset(seed=0)
+    assert env.step(MEMBERS)[1] == 0.25, "a reward at the third step is discounted twice"
 
 
 def test_a_masked_option_is_never_silent(options: Options) -> None:
@@ -127,10 +130,14 @@ def test_a_masked_option_is_never_silent(options: Options) -> None:
 
 @pytest.mark.filterwarnings("ignore:a masked option runs")
 @pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version")
-def test_agents_without_masks_play_masked_options(options: Options) -> None:
+def test_agents_without_masks_play_masked_options(options: Options, ensemble: Ensemble) -> None:
     """Spec E1: stable-baselines3's PPO, its checker and Gymnasium's, which draw from all actions."""
     env = hypogoal.OptionEnv(SameLayout(corridor()), options)
-    check_env(hypogoal.OptionEnv(corridor(), options), skip_render_check=True)
+    for each in (
+        hypogoal.OptionEnv(corridor(), options),
+        hypogoal.SubgoalReward(ensemble).wrap(corridor(), ends=False),
+    ):
+        check_env(each, skip_render_check=True)
     check_sb3(env, skip_render_check=True)
     met: list[bool] = []
 
@@ -217,14 +224,6 @@ def test_options_go_to_another_process(made: Path, options: Options) -> None:
         observation, *_ = env.step(action)
 
 
-def test_gymnasium_accepts_the_wrappers(options: Options, ensemble: Ensemble) -> None:
-    """Spec E1: Gymnasium's checker, whose warnings are errors here, but for the one that says: wrapped."""
-    wrapped = [hypogoal.OptionEnv(corridor(), options), hypogoal.SubgoalReward(ensemble).wrap(corridor(), ends=False)]
-    for env in wrapped:
-        with pytest.warns(UserWarning, match="different from the unwrapped version"):
-            check_env(env, skip_render_check=True)
-
-
 def test_pictures_that_are_flipped_views(options: Options, ensemble: Ensemble) -> None:
     """Spec E1: as BGR to RGB gives them; networks see the same as of a copy."""
     env = hypogoal.OptionEnv(TimeLimit(Flipped(), 30), options)
@@ -255,20 +254,6 @@ def test_pictures_without_an_axis_of_colours(tmp_path: Path) -> None:
     ):
         assert env.reset(seed=0)[0].shape == (48, 48)
         assert env.step(0)[0].shape == (48, 48)
-
-
-def test_options_in_a_vector_of_environments(options: Options) -> None:
-    """Spec E1: several option environments step together, each with its own masks."""
-    envs = SyncVectorEnv([lambda: hypogoal.OptionEnv(corridor(), options) for _ in range(3)])
-    observations, _ = envs.reset(seed=[0, 0, 0])
-    assert observations.shape == (3, 48, 48, 3)
-    left, right = 0, MEMBERS
-    _, rewards, terminated, _, infos = envs.step(np.array([left, right, left]))
-    assert rewards.tolist() == [0, 1, 0] and terminated.tolist() == [False, True, False]
-    assert infos["duration"].tolist() == [2, 3, 2]
-    masks = np.stack(envs.call("action_masks"))
-    assert masks.tolist() == [[False, False, True, True], [True, True, False, False], [False, False, True, True]]
-    envs.close()
 
 
 @pytest.mark.parametrize("by", ["any", "vote", "all", 0, np.int64(1)])
@@ -328,11 +313,7 @@ class FromLeftEnd(gymnasium.Wrapper):  # type: ignore[type-arg]
 
 @pytest.mark.parametrize(
     ("start", "away", "paid"),
-    [
-        ("unpaid", 1, [0, 0, 1, 0, 0, 0, 1]),
-        ("unpaid", 2, [0, 0, 0, 0, 0, 0, 1]),
-        ("paid", 1, [1, 0, 1, 0, 0, 0, 1]),
-    ],
+    [("unpaid", 1, [0, 0, 1, 0, 0, 0, 1]), ("unpaid", 2, [0, 0, 0, 0, 0, 0, 1]), ("paid", 1, [1, 0, 1, 0, 0, 0, 1])],
 )
 def test_an_episode_that_begins_inside(made: Path, start: str, away: int, paid: list[int]) -> None:
     """Doing nothing there is not paid, unless one wants it to be; the first such start is a warning."""
@@ -389,22 +370,6 @@ def test_observations_may_be_listed(ensemble: Ensemble) -> None:
         with pytest.raises(UserError, match="observations do not fit the ensemble"):
             ensemble.predict(odd)
     assert hypogoal.UserError is UserError
-
-
-def _first_choice(agent: MaskablePPO, env: hypogoal.OptionEnv) -> int:
-    observation, _ = env.reset()
-    return int(agent.predict(observation, action_masks=env.action_masks(), deterministic=True)[0])
-
-
-def test_maskable_ppo_learns_which_option_pays(options: Options) -> None:
-    """Spec E1: sb3-contrib's MaskablePPO on options: before training it goes left, afterwards straight to the goal."""
-    env = hypogoal.OptionEnv(SameLayout(corridor()), options, gamma=0.8)
-    agent = MaskablePPO("MlpPolicy", env, n_steps=64, batch_size=32, learning_rate=1e-3, gamma=0.8, seed=1)
-    before = [MaskablePPO("MlpPolicy", env, n_steps=64, batch_size=32, seed=seed) for seed in range(4)]
-    assert any(_first_choice(other, env) < MEMBERS for other in before), "a fresh agent may be wrong"
-    agent.learn(256)
-    assert _first_choice(agent, env) >= MEMBERS
-    assert env.step(_first_choice(agent, env))[2], "the task is over"
 
 
 def members_of(count: int) -> Ensemble:

@@ -1,15 +1,23 @@
-"""What the pages for users of the library show runs as it stands, on tiny artefacts; so do the doctests."""
+"""What the pages and the notebook for users show runs as it stands, on tiny artefacts; so do the doctests (Spec B6)."""
 
+import ast
 import doctest
 import importlib
+import json
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
 import own_domain
+import pandas as pd
 import pytest
 from command_line import run, settings
-from test_docs import blocks, commands
+from test_docs import DOCS, blocks, commands
 
+from hypogoal.check import check_domain, require
 from hypogoal.cli import main
 from hypogoal.data import open_dataset
 
@@ -74,3 +82,84 @@ def test_the_page_of_own_domains_shows_a_test_that_runs(monkeypatch: pytest.Monk
     space: dict[str, object] = {}
     exec(compile(code, "own-domain.md", "exec"), space)
     space["test_my_domain"]()  # type: ignore[operator]
+
+
+def module_of(words: str, folder: Path, name: str) -> Any:
+    """The page's block with these words as a file in a folder."""
+    [code] = [block for block in blocks(DOCS / "own-domain.md", "py") if words in block]
+    path = folder / f"{name}.py"
+    path.write_text(code, encoding="utf-8")
+    module = ModuleType(name)
+    exec(compile(code, str(path), "exec"), module.__dict__)
+    return module
+
+
+@pytest.mark.usefixtures("trusted")
+def test_the_smallest_domain_without_gymnasium(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It keeps the contract, and its option is learned."""
+    require(check_domain(module_of("class Line(Engine)", tmp_path, "line").DOMAIN))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    data, ensemble, options = tmp_path / "data.h5", tmp_path / "ensemble", tmp_path / "options"
+    run("collect", "line:DOMAIN", "--out", data, "-q")
+    run("train-ensemble", data, "--out", ensemble, "-q", *settings("members=1", "diversity=none", "workers=1"))
+    run("train-options", ensemble, "--out", options, "-q", *settings("steps=4000", "epsilon_steps=1000"))
+    episodes = pd.read_csv(options / "episodes.csv").tail(20)
+    assert episodes["succeeded"].all() and episodes["length"].median() <= 5  # four steps from the start
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("trusted")
+def test_four_rooms_from_the_page_to_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Labelled in a corner, planned and played elsewhere; no engine is written."""
+    module_of("FourRoomsEnv", tmp_path, "four_rooms")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    folder = tmp_path / "run"
+    data, ensemble = folder / "data.h5", folder / "ensemble"
+    small = settings("labelled_seeds=5,6", "unlabelled_seeds=1", "heldout_seeds=1,3,5,6", "steps=500", "explore=0")
+    run("collect", "four_rooms:DOMAIN", "--out", data, "-q", *small)
+    heldout = open_dataset(data).heldout("target")
+    np.testing.assert_array_equal(heldout.origins["planted_goal"], heldout.labels)
+    assert (heldout.origins["planted_corner"] != heldout.labels).sum() > 1
+    run("train-ensemble", data, "--out", ensemble, "-q", *settings("members=2", "steps=20", "workers=1"))
+    run(
+        "train-meta",
+        ensemble,
+        "--out",
+        folder / "meta",
+        "-q",
+        *settings("network=planned", "steps=300", "layouts=4", "max_episode_steps=40"),
+    )
+    assert json.loads((folder / "meta" / "manifest.json").read_text(encoding="utf-8"))["config"]["network"] == "planned"
+    run("evaluate", folder, "-q")
+    run("report", folder, "-q")
+    assert (folder / "report" / "index.html").is_file()
+
+
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebook.ipynb"
+MOST_BYTES = 300_000
+
+
+def shown_by(cell: str, space: dict[str, Any]) -> Any:
+    """Run a cell; the value of its last line where that is an expression."""
+    tree = ast.parse(cell)
+    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+    exec(compile(tree, NOTEBOOK.name, "exec"), space)
+    return eval(compile(ast.Expression(last.value), NOTEBOOK.name, "eval"), space) if last else None
+
+
+@pytest.mark.slow
+def test_the_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The demo's story with pictures: states, verdicts, attributions, options; numbers of each stage; a comparison."""
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("agg")
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    space: dict[str, Any] = {}
+    values = [shown_by("".join(cell["source"]), space) for cell in cells if cell["cell_type"] == "code"]
+    shown = [value._repr_html_() for value in values if value is not None]
+    assert len(plt.get_fignums()) == 4
+    plt.close("all")
+    words = ("open-red-door", "labelled loss", "success", "option agent", "first wins")
+    assert len(shown) == len(words)
+    for html, word in zip(shown, words, strict=True):
+        assert html.startswith("<pre") and word in html
+    assert NOTEBOOK.stat().st_size < MOST_BYTES

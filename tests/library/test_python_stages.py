@@ -78,12 +78,3 @@ def test_domains_of_another_program_and_of_another_name(tmp_path: Path) -> None:
     domain.name = "doorkey"
     with pytest.raises(UserError, match=r"has the name of one of hypogoal's: doorkey\. Give it another name"):
         hypogoal.collect(domain, out=tmp_path / "out")
-
-
-def test_settings_count_more_than_presets(corridor_run: Path, tmp_path: Path) -> None:
-    """Tuples are lists."""
-    (tmp_path / "mine.toml").write_text("[train-ensemble]\nsteps = 7\nlearning_rate = 0.01\n")
-    given = FEW | {"preset": str(tmp_path / "mine.toml"), "steps": 4, "sub_goals": ["left-end"]}
-    made = hypogoal.train_ensemble(corridor_run / "data.h5", out=tmp_path / "ensemble", **given)
-    config = open_artefact(made.path).config
-    assert [config[name] for name in ("steps", "learning_rate", "sub_goals")] == [4, 0.01, ["left-end"]]

@@ -24,7 +24,6 @@ from hypogoal.options.config import OptionConfig
 from hypogoal.options.conv_gru import PaperLearner
 from hypogoal.options.light import LightLearner
 from hypogoal.options.loop import Transitions
-from hypogoal.options.networks import LightQNetwork
 from hypogoal.options.termination import oracle_terminations
 
 GOALS = 5
@@ -124,12 +123,6 @@ def test_the_light_meta_policy_sees_the_whole_picture(shape: tuple[int, ...]) ->
     image[1, -3:], image[2, :, -3:] = 255, 255
     dark, below, right = LightMetaNetwork(shape, 6, None, "light")(image)
     assert not torch.equal(dark, below) and not torch.equal(dark, right)
-
-
-def test_pictures_too_small_for_options_are_refused() -> None:
-    """Spec D8, G2: one line instead of what a convolution raises."""
-    with pytest.raises(UserError, match="too small for the light networks: 7 x 7"):
-        LightQNetwork((7, 7, 3), 6, 4, None, "auto")
 
 
 def test_ppo_needs_a_step_of_each_environment_between_updates() -> None:

@@ -19,50 +19,24 @@ from hypogoal.meta.smdp import explained_variance, scaled_advantages, smdp_advan
 from hypogoal.options.choosers import Outcome
 
 
+def advantages_of(columns: list[tuple[float, ...]], trace: float) -> NDArray[np.float64]:
+    """Of decisions in a row: return, discount, value, next value, whether terminated, whether ended."""
+    returns, discounts, values, following, terminated, ended = np.array(columns).T
+    return smdp_advantages(returns, discounts, values, following, terminated > 0, ended > 0, trace)
+
+
 def test_advantages_by_hand() -> None:
     """Spec E1: two options of 3 and 2 steps, gamma .9, lambda .5, the second reaches the goal with reward 1."""
-    discounts = np.array([0.9**3, 0.9**2])
-    returns = np.array([0.0, 0.9])  # reward 1 at the option's second step
-    advantages = smdp_advantages(
-        returns,
-        discounts,
-        np.array([0.4, 0.6]),
-        np.array([0.6, 7.0]),
-        np.array([False, True]),
-        np.array([False, True]),
-        0.5,
-    )
-    last = 0.9 - 0.6
+    last = 0.9 - 0.6  # reward 1 at the option's second step
     first = 0.9**3 * 0.6 - 0.4 + 0.9**3 * 0.5 * last
-    np.testing.assert_allclose(advantages, [first, last])
+    found = advantages_of([(0.0, 0.9**3, 0.4, 0.6, 0, 0), (0.9, 0.9**2, 0.6, 7.0, 1, 1)], 0.5)
+    np.testing.assert_allclose(found, [first, last])
 
 
 def test_a_cut_episode_bootstraps_and_does_not_leak_into_the_next() -> None:
     """Spec D2, E1: truncation is not termination."""
-    advantages = smdp_advantages(
-        np.array([0.0, 1.0]),
-        np.array([0.5, 0.5]),
-        np.zeros(2),
-        np.array([2.0, 0.0]),
-        np.array([False, True]),
-        np.array([True, True]),
-        1.0,
-    )
-    np.testing.assert_allclose(advantages, [1.0, 1.0])
-
-
-def test_lambda_one_is_the_discounted_return_minus_the_value() -> None:
-    """Spec E1: with lambda 1 the values of states between cancel, whatever the durations."""
-    rng = np.random.default_rng(0)
-    returns, values = rng.random(6), rng.random(6)
-    discounts = 0.95 ** rng.integers(1, 11, size=6)
-    next_values = np.append(values[1:], 9.0)
-    ended = np.array([False] * 5 + [True])
-    advantages = smdp_advantages(returns, discounts, values, next_values, ended, ended, 1.0)
-    total = 0.0
-    for t in reversed(range(6)):
-        total = returns[t] + discounts[t] * total
-        assert advantages[t] == pytest.approx(total - values[t])
+    found = advantages_of([(0.0, 0.5, 0.0, 2.0, 0, 1), (1.0, 0.5, 0.0, 0.0, 1, 1)], 1.0)
+    np.testing.assert_allclose(found, [1.0, 1.0])
 
 
 def test_the_advantages_scale_by_hand() -> None:
@@ -126,8 +100,7 @@ def test_masked_options_are_never_drawn() -> None:
 
 
 @pytest.mark.parametrize(
-    "network",
-    [LightMetaNetwork((64, 64, 3), 15, None, "light"), PaperMetaNetwork((64, 64, 3), 15)],
+    "network", [LightMetaNetwork((64, 64, 3), 15, None, "light"), PaperMetaNetwork((64, 64, 3), 15)]
 )
 def test_networks_give_a_score_per_option_and_a_value(network: torch.nn.Module) -> None:
     """Spec E2: shared features, an actor and a critic; early choices are nearly uniform."""

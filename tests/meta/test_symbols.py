@@ -90,25 +90,6 @@ def test_with_one_state_it_is_thompson_sampling() -> None:
     np.testing.assert_allclose(ours, theirs, atol=0.028)  # four standard errors of a difference
 
 
-def test_a_bandit_is_played_as_thompson_sampling_plays_it() -> None:
-    """The mean share of the better arm over 60 episodes and 60 seeds, against Beta-Bernoulli written out."""
-    good, bad = symbols.PRIOR * symbols.HOPE, symbols.PRIOR * (1 - symbols.HOPE)
-    chances, seeds, episodes = np.array([0.3, 0.8]), 60, 60
-    arms = {("a", arm): [(chance, 1.0, OVER), (1 - chance, 0.0, OVER)] for arm, chance in enumerate(chances)}
-    ours = [np.mean(World({"a": [0, 1]}, arms, seed).episodes(chooser_of(2, seed), episodes)) for seed in range(seeds)]
-    theirs, rng = [], np.random.default_rng(7)
-    for _ in range(seeds):
-        counts, rewards = np.zeros((2, 2)), []
-        for _ in range(episodes):
-            arm = rng.beta(counts[1] + good, counts[0] + bad).argmax()
-            result = int(rng.random() < chances[arm])
-            counts[result, arm] += 1
-            rewards.append(result)
-        theirs.append(np.mean(rewards))
-    wide = 4 * np.hypot(np.std(ours), np.std(theirs)) / seeds**0.5
-    assert abs(np.mean(ours) - np.mean(theirs)) < wide
-
-
 def test_values_are_those_of_the_equations() -> None:
     """Two symbols by hand: r = .5 then on to b, where 3 of 4 executions end with 1; the posterior's mean."""
     model = Model(1, 1, 1.0)
@@ -139,18 +120,6 @@ def test_what_an_option_did_elsewhere_tells_what_it_is_worth_here() -> None:
     expected = [0.9 * (5 + good) / all_of_it, 0.9 * good / all_of_it, 0.0, good / (good + bad)]
     expected[2] = 0.9 * (good + 5 * expected[0]) / all_of_it  # it goes on from here, where option 0 is best
     np.testing.assert_allclose(value, expected, atol=1e-4)
-
-
-def test_symbols_that_do_not_offer_an_option_never_choose_it() -> None:
-    """Masks: places of one, two and three options; the chain's reward lies behind all three."""
-    offered = {"a": [0], "b": [0, 1], "c": [0, 1, 2]}
-    moves = {("a", 0): sure(0, "b"), ("b", 0): sure(0, "b"), ("b", 1): sure(0, "c")}
-    moves |= {("c", option): sure(float(option == 2), OVER) for option in range(3)}
-    world, chooser = World(offered, moves), chooser_of(3)
-    assert np.mean(world.episodes(chooser, 40)[20:]) >= 0.9
-    assert world.episode(frozen(chooser)) == (1.0, [0, 1, 2])
-    qualities = chooser.model.qualities(np.asarray)
-    np.testing.assert_array_equal(np.isfinite(qualities), chooser.model.symbols > 0)
 
 
 def test_a_cut_is_not_the_end_of_the_task() -> None:
@@ -226,25 +195,6 @@ def test_it_finds_a_reward_that_was_long_in_coming(seed: int) -> None:
     assert sum(returns[:8]) == 0, "or it was luck"
     assert np.mean(returns[220:]) >= 0.9
     assert world.episode(frozen(chooser)) == (1.0, right)
-
-
-def test_slippery_options_are_judged_by_their_shares() -> None:
-    """One option arrives in .9 of its executions, one in .4, each else stays; a trap pays .5 at once."""
-    offered = {"a": [0, 1, 2], "b": [0, 1]}
-    moves = {
-        ("a", 0): [(0.9, 0.0, "b"), (0.1, 0.0, "a")],
-        ("a", 1): [(0.4, 0.0, "b"), (0.6, 0.0, OVER)],
-        ("a", 2): sure(0.5, OVER),
-        ("b", 0): [(0.8, 1.0, OVER), (0.2, 0.0, "b")],
-        ("b", 1): [(0.6, 1.0, OVER), (0.4, 0.0, OVER)],
-    }
-    best = []
-    for seed in range(5):
-        chooser = chooser_of(3, seed)
-        World(offered, moves, seed).episodes(chooser, 150)
-        policy = frozen(chooser).plans[0][:2]
-        best.append(policy.tolist() == [0, 0])
-    assert sum(best) >= 4
 
 
 def test_thousands_of_symbols_take_bounded_work(monkeypatch: pytest.MonkeyPatch) -> None:

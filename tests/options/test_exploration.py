@@ -16,12 +16,6 @@ def played(mode: str, epsilon: float, steps: int, age=lambda t: t, count: int = 
     return np.array([exploration.mix(policy, chance, np.full(count, age(t))) for t in range(steps)])
 
 
-@pytest.mark.parametrize("mode", ["independent", "persistent"])
-def test_no_chance_no_random_action(mode: str) -> None:
-    """Spec D3: with epsilon 0 the policy plays."""
-    assert (played(mode, 0.0, 500) == GREEDY).all()
-
-
 def test_independent_actions_last_one_step() -> None:
     """Spec D3: epsilon is the share of random actions; the next one knows nothing of the last."""
     actions = played("independent", 0.3, 20_000)[:, 0]

@@ -14,6 +14,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -335,46 +336,31 @@ def thinned(items: list[Any]) -> list[Any]:
 # Collected states: the same bytes.
 
 
-@part("arrays-doorkey")
-def arrays_doorkey(work: Path) -> Table:
-    return hashes(doorkey_data(work))
+def hashes_of(data: Callable[[Path], Path], work: Path) -> Table:
+    return hashes(data(work))
 
 
-@part("arrays-montezuma", slow=True)
-def arrays_montezuma(work: Path) -> Table:
-    return hashes(montezuma_data(work))
-
-
-@part("arrays-rooms")
-def arrays_rooms(work: Path) -> Table:
-    return hashes(rooms_data(work))
+for name, data in (("doorkey", doorkey_data), ("montezuma", montezuma_data), ("rooms", rooms_data)):
+    part(f"arrays-{name}", slow=name == "montezuma")(partial(hashes_of, data))
 
 
 # Hypotheses: what members predict after 40 steps.
 
 
-def add_predictions(name: str, data: Callable[[Path], Path], objective: str, *, slow: bool, **changed: object) -> None:
-    """A part ``predictions-NAME-OBJECTIVE``."""
+def add_predictions(name: str, data: Callable[[Path], Path], kind: str, *, slow: bool = False, **how: object) -> None:
+    """A part ``predictions-NAME-KIND``."""
 
-    @part(f"predictions-{name}-{objective}", slow=slow)
+    @part(f"predictions-{name}-{kind}", slow=slow)
     def make(work: Path) -> Table:
-        return predictions(work, data(work), f"{name}-{objective}", diversity=objective, **changed)
+        return predictions(work, data(work), f"{name}-{kind}", **how)
 
 
 for objective in OBJECTIVES:
-    add_predictions("vector", vector_data, objective, slow=False, **FIXED)
-add_predictions("doorkey", doorkey_data, "dbat", slow=False, batch_size=32)
-add_predictions("montezuma", montezuma_data, "dbat", slow=True, batch_size=16, members=2)
-
-
-@part("predictions-rooms-simultaneous")
-def rooms_at_once(work: Path) -> Table:
-    return predictions(work, rooms_data(work), "rooms-simultaneous", **IN_ROOMS)
-
-
-@part("predictions-rooms-sequential")
-def rooms_one_by_one(work: Path) -> Table:
-    return predictions(work, rooms_data(work), "rooms-sequential", **IN_ROOMS | {"schedule": "sequential"})
+    add_predictions("vector", vector_data, objective, diversity=objective, **FIXED)
+add_predictions("doorkey", doorkey_data, "dbat", diversity="dbat", batch_size=32)
+add_predictions("montezuma", montezuma_data, "dbat", slow=True, diversity="dbat", batch_size=16, members=2)
+for schedule in ("simultaneous", "sequential"):
+    add_predictions("rooms", rooms_data, schedule, **IN_ROOMS | {"schedule": schedule})
 
 
 # Options and the choice among them.
@@ -394,14 +380,8 @@ def paper_network(work: Path, recurrence: int) -> Table:
     return [("line", "column", "value"), *log_of(options), *weights_of(options / "options.safetensors")]
 
 
-@part("paper-network-with-memory", traced=True, slow=True)
-def paper_network_with_memory(work: Path) -> Table:
-    return paper_network(work, 10)
-
-
-@part("paper-network-without-memory", traced=True, slow=True)
-def paper_network_without_memory(work: Path) -> Table:
-    return paper_network(work, 1)
+for name, recurrence in (("with", 10), ("without", 1)):
+    part(f"paper-network-{name}-memory", traced=True, slow=True)(partial(paper_network, recurrence=recurrence))
 
 
 @part("gaussian-head", traced=True)

@@ -111,16 +111,6 @@ def test_runs_of_one_agent_without_a_common_seed_have_no_pairs(tmp_path):
     assert "no two runs share a seed" in run("show", made.path).out
 
 
-def test_methods_side_by_side(runs, tmp_path):
-    """Spec F5: runs without a common agent have one table; there are no pairs."""
-    write_baseline(tmp_path / "other", "dqn", 100, 0, 30, steps=6_000)
-    evaluate(tmp_path / "other", quiet=True)
-    made = compare([runs / "fast", tmp_path / "other"], tmp_path / "out")
-    text = (made.path / "index.html").read_text(encoding="utf-8")
-    assert text.count("<figure") == 0 and "No two runs share a seed" in text
-    assert "PPO tuned" in text and "DQN tuned" in text
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

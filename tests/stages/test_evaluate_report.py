@@ -90,15 +90,6 @@ def test_members_are_judged_on_heldout_states(tiny_run, results):
     assert len(table[table["quantity"] == "best"]) == len(GOALS) + 1
 
 
-def test_thresholds_are_those_of_members(tiny_run, results):
-    """Whatever rule set them."""
-    source = open_artefact(tiny_run / "ensemble-none")
-    wanted = read_ensemble(source.path, source.config, "open-red-door").thresholds.tolist()
-    assert wanted[0] != 0.5
-    for name, thresholds in (("another", [0.5] * 2), ("ensemble-none", wanted)):
-        assert results.of(artefact=name, quantity="threshold", scope="heldout")["value"].tolist() == thresholds
-
-
 def test_selection_counts_every_decision(tiny_run, results):
     """Spec F6: what was chosen and offered, and the random chooser's control beside it; oracle has no members."""
     table = pd.read_csv(tiny_run / "evaluation/tables/selection.csv")

@@ -63,16 +63,6 @@ def test_what_does_not_fit_is_one_line(pairs: list[str], fault: str, corridor_ru
     refuses(fault, "train-options", *words)
 
 
-ALONE = [("decisions=64", "chooser=random"), ("embedding=tiles", "network=planned")]
-
-
-@pytest.mark.parametrize(("pair", "without"), ALONE)
-def test_settings_that_do_nothing_are_refused(pair: str, without: str, corridor_run: Path, tmp_path: Path) -> None:
-    """Spec G2: beside choosers and learners without them."""
-    words = ["train-meta", corridor_run / "ensemble", "--out", tmp_path / "out", *FEW, *settings(pair, without)]
-    refuses(f"has this setting only beside another choice: {pair.partition('=')[0]}", *words)
-
-
 def ensembles_on(engine: DoorKeyEngine) -> list[Ensemble]:
     """Two of two members each, that are positive in a part of the states, surely."""
     pictures, ensembles = engine.images(engine.reachable()), []
