@@ -73,7 +73,9 @@ def _titles(distances: Distances, method: str) -> list[str]:
     """Name a method's columns, the first with the number of seeds that each of its ladders has."""
     counts = sorted({len(seeds) for (name, _), seeds in distances.items() if name == method})
     title = f"{METHODS[method]} ({', '.join(map(str, counts))} seed{'s' if counts != [1] else ''})"
-    return [title] if method == CONTROL else [f"{title}: best member", "mean member", "worst member"]
+    if method == CONTROL:
+        return [title]
+    return [f"{title}, best", *(f"{METHODS[method]}, {which}" for which in ("mean", "worst"))]
 
 
 def _of_group(distances: Distances, method: str, ladders: tuple[str, ...]) -> dict[int, float]:
