@@ -31,7 +31,7 @@ from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import ranking
 from hypogoal.hypotheses.training import EnsembleTraining
 from hypogoal.observations import spread_rows
-from studies.cells import Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import TITLES, Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table
 from studies.ladders import METHODS as OF_LADDERS
 from studies.ladders import states_of
 
@@ -155,14 +155,21 @@ def tables(path: Path) -> Iterator[str]:
         of_dbat = cells["dbat", step]
         shared = [seed for seed in seeds if seed in of_dbat]
 
-        numbers = [method, str(step)]
+        numbers = [TITLES[method], str(step)]
         for name in ("common", "signed"):
             own, dbats = (_over(cell, shared, partial(_mean, name=name)) for cell in (seeds, of_dbat))
             numbers += [interval(own), "-" if method == "dbat" else interval(dbats - own)]
         for of_members in (_least_near, _most_near, _ranking_of_nearest, partial(_mean, name="ranking_unseen")):
             numbers.append(interval(_over(seeds, shared, of_members)))
         rows.append(numbers)
-    titles = ["", "steps", "in common", "D-BAT minus it", "signed", "D-BAT minus it"]
+    titles = [
+        "members",
+        "training steps",
+        "attention in common",
+        "D-BAT has more in common by",
+        "cosine of signed attributions",
+        "D-BAT's cosine is higher by",
+    ]
     early_and_late = [numbers[: len(titles)] for numbers in rows if numbers[1] in ("25", "300")]
     yield from table(titles, early_and_late)
     yield from table([*titles, "near the agent, least member", "most", "ranking of that member", "mean ranking"], rows)

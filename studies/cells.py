@@ -31,6 +31,12 @@ Jobs: TypeAlias = dict[Cell, Callable[[], list[Row]]]  # what makes a cell's row
 # How many values an interval takes: ``studies.coverage`` chose method and number for each kind of value.
 SCORES_FROM = 4
 RESAMPLES = 20_000
+TITLES = {  # what pages call the methods of ensembles
+    "dbat": "D-BAT",
+    "none": "no diversity",
+    "dbat-unpaired": "control that pairs nobody",
+    "cnn": "one classifier",
+}
 
 
 def parser_of(doc: str | None, seeds: str = "", *, run: str = "") -> argparse.ArgumentParser:

@@ -56,19 +56,23 @@ POLICIES = {"learned": "learned options", PLANNED: "planned options"}  # baselin
 # Steps in the plain world, and whether uniform-random choice solved it by then.
 PRACTICE, PRACTISED = "practice", "practised"
 MOST_LAYOUTS = 10  # side by side in a table; more are in the rows alone
-ROOMS = {  # columns, by what their files' names end in
-    "seeds 400 to 409": "-joint",
-    "third setting": "",
-    "second setting": "-second",
-    "first setting": "-first",
+NEWEST = "seeds 400 to 409"
+ROOMS = {  # runs, by what their files' names end in
+    NEWEST: "-joint",
+    "third": "",
+    "second": "-second",
+    "first": "-first",
 }
 Agent = tuple[str, str]  # method, policy
 ValuesOf = Callable[[Agent, str, str], NDArray[np.float64]]  # of an agent by chooser and quantity
 COLUMNS = ("method", "policy", "layout", "seed", "chooser", "quantity", "value")
 HIGH = 0.9
-SHARES = "Share of episodes solved (seeds of ten with .9): the agent / uniform-random choice among its own options."
 LEAST = {"within_rho": -1.0}  # of all others 0
-SHOWN = {"success": "solved", "within_rho": "within-rho", "pair": "better of two"}
+SHOWN = {
+    "success": "solved by the agent",
+    "within_rho": "rank correlation of preference and quality",
+    "pair": "better of two taken",
+}
 
 
 def collect(run: Path, path: Path, baselines: Path | None = None) -> None:
@@ -154,7 +158,7 @@ def tables(path: Path) -> Iterator[str]:
 
     yield f"Mean over {len(layouts)} layouts with a 95 % interval; of choices, where they are defined.\n"
     yield from table(
-        ["", "solved by uniform-random choice", *SHOWN.values(), "95 % solved on"],
+        ["members and options", "solved by random choice", *SHOWN.values(), "layouts on which 95 % are solved"],
         (
             [
                 title,
@@ -166,7 +170,8 @@ def tables(path: Path) -> Iterator[str]:
         ),
     )
     yield "Episodes solved, layout by layout: the median of D-BAT minus the other, and where D-BAT is above.\n"
-    yield from table(["", "D-BAT minus it", "layouts"], _apart(agents, values_of))
+    titles = ["D-BAT compared with", "D-BAT solves more by, median", "layouts on which it solves more"]
+    yield from table(titles, _apart(agents, values_of))
     if len(layouts) <= MOST_LAYOUTS:
         yield "Share of episodes solved, layout by layout: the agent / uniform-random choice among its own options."
         yield from by_layout(shares, optioned)
@@ -191,18 +196,25 @@ def solved_by(rows: list[dict[str, str]], method: str, chooser: str) -> NDArray[
     return np.array([float(r["value"]) for r in rows if (r["method"], r["chooser"], r["quantity"]) == wanted])
 
 
-def _shown(rows: list[dict[str, str]], method: str) -> str:
-    solved, uniform = (solved_by(rows, method, chooser) for chooser in ("agent", "uniform"))
-    return f"{share(solved)} ({(solved >= HIGH).sum()}) / {uniform.mean():.2f}" if len(solved) else "-"
+def _solved(rows: list[dict[str, str]]) -> Iterator[list[str]]:
+    """Rows of what the agents of one run solve, and random choice among the same options."""
+    for truth, (method, title) in product(TRUTHS, ENSEMBLES.items()):
+        solved, uniform = (solved_by(rows, f"{method}-truth-{truth}", chooser) for chooser in ("agent", "uniform"))
+        if len(solved):
+            high = f"{(solved >= HIGH).sum()} of {len(solved)}"
+            yield [truth, title, share(solved), high, f"{uniform.mean():.2f}"]
 
 
 def rooms(path: Path) -> Iterator[str]:
     """Settings side by side, and joint beside D-BAT; every other number is in the rows."""
     settings = {which: _read(path.with_stem(path.stem + suffix)) for which, suffix in ROOMS.items()}
-    methods = [method for method in IN_ROOMS if any(len(solved_by(r, method, "agent")) for r in settings.values())]
-    yield f"{SHARES}\n"
-    yield from table(["", *settings], ([METHODS[m], *(_shown(rows, m) for rows in settings.values())] for m in methods))
-    newest = settings["seeds 400 to 409"]
+    newest = settings.pop(NEWEST)
+    titles = ["rewarded", "members", "solved by the agent", "seeds with at least .9", "solved by random choice"]
+    yield f"Share of episodes solved, {NEWEST}.\n"
+    yield from table(titles, _solved(newest))
+    yield "The runs before, each with settings of its own.\n"
+    earlier = [[which, *cells] for which, rows in settings.items() for cells in _solved(rows)]
+    yield from table(["setting", *titles], earlier)
     rows = []
     for method, title in ENSEMBLES.items():
         if method != "joint" and len(solved_by(newest, f"{method}-truth-shape", "agent")):
@@ -210,22 +222,27 @@ def rooms(path: Path) -> Iterator[str]:
     yield "Joint minus the other, seed by seed: median of the differences.\n"
     yield from table(["", *TRUTHS], rows)
     yield "All four runs, forty seeds: D-BAT minus the other.\n"
-    yield from table(["", *TRUTHS, "both"], (_over_runs([*settings.values()], method) for method in ("none", "one")))
+    runs = [newest, *settings.values()]
+    titles = [
+        "D-BAT compared with",
+        "rewarded",
+        "D-BAT solves more by, mean",
+        "by, median",
+        "seeds on which it solves more",
+    ]
+    yield from table(titles, (row for method in ("none", "one") for row in _over_runs(runs, method)))
 
 
-def _over_runs(runs: list[list[dict[str, str]]], method: str) -> list[str]:
-    """What D-BAT solves more than another method, over the seeds of all runs: by truth, and the mean of both."""
+def _over_runs(runs: list[list[dict[str, str]]], method: str) -> Iterator[list[str]]:
+    """Rows of what D-BAT solves more than another method, over the seeds of all runs."""
     gaps = []
     for truth in TRUTHS:
         of_dbat = np.concatenate([solved_by(rows, f"dbat-truth-{truth}", "agent") for rows in runs])
         of_other = np.concatenate([solved_by(rows, f"{method}-truth-{truth}", "agent") for rows in runs])
         gaps.append(of_dbat - of_other)
     gaps.append(np.mean(gaps, axis=0))
-    return [ENSEMBLES[method], *map(_gap, gaps)]
-
-
-def _gap(values: NDArray[np.float64]) -> str:
-    return f"mean {values.mean():.3f}, median {amount(values)}, above in {won(values)}"
+    for truth, values in zip((*TRUTHS, "either, mean of both"), gaps, strict=True):
+        yield [ENSEMBLES[method], truth, f"{values.mean():.3f}", amount(values), won(values)]
 
 
 def _joint_minus(rows: list[dict[str, str]], method: str, truth: str) -> str:

@@ -107,7 +107,7 @@ def tables(path: Path) -> Iterator[str]:
         )
     yield "Zero-shot success within twice the shortest path on new layouts, mean over five sub-goals."
     yield "Picked: the member that is best on 50 layouts learned in.\n"
-    titles = ["options", "mean member", "picked member", "false positives", "seeds"]
+    titles = ["members and policies", "reached, mean member", "reached, picked member", "false positives", "seeds"]
     yield from table(titles, rows)
     yield "Differences over the seeds that both have.\n"
     contrasts = (_contrast(within, methods) for methods in CONTRASTS)
@@ -142,15 +142,11 @@ def tables_of_agents(path: Path) -> Iterator[str]:
     for world, world_title in WORLDS.items():
         for options, title in OPTIONS.items():
             if agents := cells[world, options]:
-                shares = [_beside_uniform(agents, score) for score in SCORES]
-                rows.append([f"{world_title}, {title}", *shares, str(len(agents))])
-    yield "100 new layouts, without learning there, those that can be solved: agent / uniform-random choice.\n"
-    yield from table(["world, options", *SCORES.values(), "seeds"], rows)
-
-
-def _beside_uniform(agents: list[dict[str, str]], score: str) -> str:
-    columns = [_column(agents, score), _column(agents, score + UNIFORM)]
-    return " / ".join(interval(values, 2) for values in columns if len(values))
+                columns = [_column(agents, score + chooser) for score in SCORES for chooser in ("", UNIFORM)]
+                rows.append([world_title, title, *(interval(values, 2) for values in columns), str(len(agents))])
+    yield "100 new layouts, without learning there, those that can be solved.\n"
+    titles = [f"{score}, {chooser}" for score in SCORES.values() for chooser in ("agent", "random choice")]
+    yield from table(["world", "options", *titles, "seeds"], rows)
 
 
 def _column(agents: list[dict[str, str]], name: str) -> NDArray[np.float64]:

@@ -172,14 +172,17 @@ def lowest_after(step: NDArray[np.int64], succeeded: NDArray[np.bool_], since: f
     return float(recent[step[LAST - 1 :] >= since].min())
 
 
-def later(reached: NDArray[np.float64], of_reference: NDArray[np.float64]) -> str:
-    """Write how many times the reference's steps agents took on the same layouts: the median of the ratios.
+def later(reached: NDArray[np.float64], of_reference: NDArray[np.float64]) -> tuple[str, str]:
+    """Write how many times the reference's steps agents took on the same layouts.
 
-    What was never reached took longer than all else. In brackets the layouts on which it took longer.
+    What was never reached took longer than all else.
+
+    Returns:
+        The median of the ratios, and on how many layouts agents took longer.
     """
     both = ~np.isnan(reached) & ~np.isnan(of_reference)
     ratios = reached[both] / of_reference[both]
-    return f"{amount(ratios)} ({won(ratios - 1)})"
+    return amount(ratios), won(ratios - 1)
 
 
 def tables(path: Path) -> Iterator[str]:
@@ -208,22 +211,26 @@ def tables(path: Path) -> Iterator[str]:
             METHODS[method],
             f"{np.isfinite(finite(reached)).sum()} of {ran}",
             f"{soon:,.0f}" if np.isfinite(soon) else "never",
-            "-" if method == REFERENCE else later(reached, values_of(REFERENCE, "steps_to_95")),
+            *(("-", "-") if method == REFERENCE else later(reached, values_of(REFERENCE, "steps_to_95"))),
             share(finite(values_of(method, "success"))),
             amount(finite(values_of(method, "length_over_shortest"))),
-            f"{lowest.min():.2f} ({(lowest >= 0.9).sum()} of {len(lowest)})" if len(lowest) else "-",
+            f"{lowest.min():.2f}" if len(lowest) else "-",
+            f"{(lowest >= 0.9).sum()} of {len(lowest)}" if len(lowest) else "-",
         ]
 
     yield f"Training, {len(layouts)} layouts; of the last 100 episodes over layouts.\n"
     titles = [
-        "",
-        "reached 95 %",
-        "95 % at, median",
+        "agent",
+        "layouts with 95 %",
+        "steps until then, median",
         "its steps / D-BAT's, median",
-        "solved",
+        "layouts on which it takes longer",
+        "solved at the end",
         "length / shortest, median",
+        "lowest share after 95 %",
+        "layouts that stay at .90 or more",
     ]
-    yield from table([*titles, "lowest after (at least .90)"], (training(method) for method in methods))
+    yield from table(titles, (training(method) for method in methods))
     frozen = [method for method in methods if len(finite(values_of(method, "success", "frozen")))]
     yield "Without further training: the agent / uniform-random choice among its own options.\n"
     rows_of_play = []

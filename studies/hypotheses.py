@@ -38,7 +38,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import best_threshold, cross_fitted, halves, member_scores, ranking
 from hypogoal.hypotheses.training import EnsembleTraining
-from studies.cells import Row, interval, parser_of, printed, read_rows, run_cells, table
+from studies.cells import TITLES, Row, interval, parser_of, printed, read_rows, run_cells, table
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -162,8 +162,8 @@ SHOWN: dict[str, Callable[[dict[str, NDArray[np.float64]]], float]] = {
     "ranking, cross-fitted best": lambda members: crossed(members, "ranking"),
     "ranking, mean member": lambda members: float(members["ranking"].mean()),
     "balanced accuracy at 0.5, cross-fitted best": lambda members: crossed(members, "balanced_accuracy"),
-    "mean member": lambda members: float(members["balanced_accuracy"].mean()),
-    "worst member": lambda members: float(members["balanced_accuracy"].min()),
+    "balanced accuracy at 0.5, mean member": lambda members: float(members["balanced_accuracy"].mean()),
+    "balanced accuracy at 0.5, worst member": lambda members: float(members["balanced_accuracy"].min()),
 }
 CROSSED = ("ranking, cross-fitted best", "balanced accuracy at 0.5, cross-fitted best")
 
@@ -185,14 +185,19 @@ def tables(path: Path) -> Iterator[str]:
     yield f"Test layouts, {_seeds(test)}, mean over the five sub-goals with a 95 % interval over seeds.\n"
     every = DOMAIN.sub_goals
     yield from table(
-        ["", "steps", *SHOWN],
+        ["method", "training steps", *SHOWN],
         (
-            [m, str(chosen[m]), *(interval(by_seed(test, m, chosen[m], score, every)) for score in SHOWN.values())]
-            for m in tested
+            [
+                TITLES[method],
+                str(chosen[method]),
+                *(interval(by_seed(test, method, chosen[method], score, every)) for score in SHOWN.values()),
+            ]
+            for method in tested
         ),
     )
-    yield "D-BAT minus the other, cross-fitted ranking, seed by seed (seeds in which D-BAT is above).\n"
-    yield from table(["", "all", *every], _differences(test, chosen, tested))
+    yield "D-BAT minus the other, cross-fitted ranking, seed by seed.\n"
+    titles = ["D-BAT compared with", "sub-goal", "D-BAT ranks better by", "seeds on which it ranks better"]
+    yield from table(titles, _differences(test, chosen, tested))
 
 
 def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> Iterator[str]:
@@ -208,12 +213,16 @@ def _curves(numbers: Numbers, chosen: dict[str, int], shown: Sequence[int]) -> I
 
 def _differences(test: Numbers, chosen: dict[str, int], tested: Sequence[str]) -> Iterator[list[str]]:
     for method in tested:
-        cells = []
-        for goals in (DOMAIN.sub_goals, *((goal,) for goal in DOMAIN.sub_goals)):
+        if method == "dbat":
+            continue
+        for title, goals in {
+            "mean of all five": DOMAIN.sub_goals,
+            **{goal: (goal,) for goal in DOMAIN.sub_goals},
+        }.items():
             dbat, other = (by_seed(test, name, chosen[name], SHOWN[CROSSED[0]], goals) for name in ("dbat", method))
-            cells.append(f"{interval(dbat - other)} ({above(dbat, other).sum()})" if len(dbat) == len(other) else "-")
-        if method != "dbat":
-            yield [method, *cells]
+            if len(dbat) == len(other):
+                count = f"{above(dbat, other).sum()} of {len(dbat)}"
+                yield [TITLES[method], title, interval(dbat - other), count]
 
 
 def _seeds(numbers: Numbers) -> str:

@@ -45,6 +45,7 @@ METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of t
     "oracle": ("true sub-goal", {"diversity": "dbat"}, {"termination": "oracle"}),  # whatever the ensemble
 }
 ENSEMBLES = {"oracle": "dbat"}  # whose ensemble is another method's
+OF_SEVERAL = ("dbat", "none")  # whose members differ
 MEMBERS, STEPS = 3, 40_000
 # The paper's Figure 4 has three more, whose tops are bases themselves.
 LADDERS = ("1L", "1M", "1R", "2-6", "3-9", "14-22", "0-4", "5-11", "7-13")
@@ -122,7 +123,8 @@ def tables(path: Path) -> Iterator[str]:
         if distances := read(path, groups):
             yield from _tables(groups, distances, read(path, groups, "inside_at_start"))
             if groups < MOST_GROUPS:
-                yield from _leads(groups, {"": distances, ", without the rule": read(path, groups, "stop_distance")})
+                by_true_distance = read(path, groups, "stop_distance")
+                yield from _leads(groups, {"300 units": distances, "its true distance": by_true_distance})
 
 
 def _leads(groups: int, measures: dict[str, Distances]) -> Iterator[str]:
@@ -130,13 +132,20 @@ def _leads(groups: int, measures: dict[str, Distances]) -> Iterator[str]:
     rooms = {str(room) for group in LABELLED_ROOMS[CLIMB_DOWN.name]["groups"][:groups] for room in group}
     new = [ladder for ladder in LADDERS if not rooms & {*ladder.rstrip("LMR").split("-")}]
     rows = []
-    for (rule, distances), other in product(measures.items(), ("none", "cnn")):
+    for (counted, distances), other in product(measures.items(), ("none", "cnn")):
         for name, of_members in (("best", np.min), ("mean", np.mean)):
             gaps = gaps_of(distances, other, new, of_members)
-            title = f"{METHODS[other][0]}, {name} member{rule}"
-            rows.append([title, amount(np.array([*gaps.values()]), 0), ", ".join(map(str, gaps))])
+            seeds = ", ".join(map(str, gaps))
+            rows.append([METHODS[other][0], f"{name} member", counted, amount(np.array([*gaps.values()]), 0), seeds])
     yield f"N = {groups}: the other minus D-BAT, mean over {len(new)} ladders without labels.\n"
-    yield from table(["", "the other minus D-BAT", "seeds"], rows)
+    titles = [
+        "compared with D-BAT",
+        "which member",
+        "a start inside the set counts",
+        "stops farther by, units",
+        "seeds",
+    ]
+    yield from table(titles, rows)
 
 
 def gaps_of(
@@ -159,14 +168,18 @@ def _tables(groups: int, distances: Distances, inside: Distances) -> Iterator[st
     methods = [method for method in METHODS if any(name == method for name, _ in distances)]
     learned = [method for method in methods if method != "oracle"]  # the control may lag behind
     whole = [ladder for ladder in LADDERS if all((method, ladder) in distances for method in learned)]
-    yield f"N = {groups}: distance to the nearest true base, RAM units; best / mean / worst member (one if equal).\n"
+    yield f"N = {groups}: distance to the nearest true base, RAM units.\n"
     rows = []
     for ladder in whole:
-        stops = [_three(distances.get((method, ladder), {})) for method in methods]
-        began = " / ".join(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned)
-        rows.append([ladder, *stops, began])
-    titles = [METHODS[method][0] for method in methods]
-    yield from table(["ladder", *titles, "started inside: D-BAT, no diversity, CNN"], rows)
+        stops = [stop for method in methods for stop in _stops(method, distances.get((method, ladder), {}))]
+        rows.append([ladder, *stops])
+    titles = [title for method in methods for title in _titles(method)]
+    yield from table(["ladder", *titles], rows)
+    yield f"N = {groups}: the share of executions that began inside their own termination set, mean over members.\n"
+    began = []
+    for ladder in whole:
+        began.append([ladder, *(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned)])
+    yield from table(["ladder", *(METHODS[method][0] for method in learned)], began)
 
 
 def best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:
@@ -177,11 +190,19 @@ def best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float
     return best, mean, worst
 
 
-def _three(seeds: dict[int, NDArray[np.float64]]) -> str:
+def _titles(method: str) -> list[str]:
+    """Name a method's columns: one for each of best, mean and worst member, if its members differ."""
+    title = METHODS[method][0]
+    return [f"{title}, {which}" for which in ("best", "mean", "worst")] if method in OF_SEVERAL else [title]
+
+
+def _stops(method: str, seeds: dict[int, NDArray[np.float64]]) -> list[str]:
+    """Write a method's cells of one ladder, in the order of its columns."""
     if not seeds:
-        return "-"
-    numbers = [f"{number:.0f}" for number in best_mean_worst(seeds)]
-    return " / ".join(numbers if len(set(numbers)) > 1 else numbers[:1])
+        return ["-"] * len(_titles(method))
+    best, mean, worst = best_mean_worst(seeds)
+    shown = (best, mean, worst) if method in OF_SEVERAL else (mean,)
+    return [f"{number:.0f}" for number in shown]
 
 
 def main() -> None:

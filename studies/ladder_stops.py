@@ -71,20 +71,16 @@ def spread(stops: NDArray[np.int64]) -> float:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """What the stops say, as lines of Markdown, the seeds side by side."""
+    """What the stops say, as lines of Markdown, a row for each seed."""
     every = read(path)
     rows = []
     for method, title in METHODS.items():
-        seeds = sorted(seed for name, seed in every if name == method)
-        if not seeds:
-            continue
-        stops = [every[method, seed] for seed in seeds]
-        at_base = [f"{(places[:, 3] == HIT).mean():.2f}" for places in stops]
-        inside = [f"{(places[:, 3] == BEGAN_INSIDE).mean():.2f}" for places in stops]
-        spreads = [f"{spread(places):.1f}" for places in stops]
-        columns = ([*map(str, seeds)], at_base, inside, spreads)
-        rows.append([title, *[", ".join(column) for column in columns]])
-    yield from table(["", "seeds", "at a base", "began inside", "spread"], rows)
+        for seed in sorted(seed for name, seed in every if name == method):
+            stops = every[method, seed]
+            at_base = f"{(stops[:, 3] == HIT).mean():.2f}"
+            inside = f"{(stops[:, 3] == BEGAN_INSIDE).mean():.2f}"
+            rows.append([title, str(seed), at_base, inside, f"{spread(stops):.1f}"])
+    yield from table(["members", "seed", "ended at a base", "began inside the own set", "spread, units"], rows)
 
 
 def draw(path: Path, seed: int, picture: Path) -> None:

@@ -33,7 +33,7 @@ from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.scores import halves, member_scores, ranking
 from hypogoal.hypotheses.training import EnsembleTraining
-from studies.cells import Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table, won
+from studies.cells import TITLES, Jobs, Row, interval, parser_of, printed, read_rows, run_cells, table, won
 
 METHODS: dict[str, dict[str, Any]] = {
     "dbat": {"diversity": "dbat"},
@@ -175,9 +175,10 @@ def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
     seeds = list(numbers["dbat"])
     yield f"N = {groups}, {len(seeds)} seeds, cross-fitted:"
     yield "length and member picked on half of the unseen rooms, scored on the other.\n"
-    titles = ["", "steps", "ranking", "balanced accuracy at 0.5", "D-BAT minus it, ranking"]
+    lengths = ["training steps picked on one half", "on the other half"]
+    scores = ["ranking", "balanced accuracy at 0.5", "D-BAT ranks better by", "seeds on which it ranks better"]
     rows = [_cross_fitted(numbers, method) for method in numbers]
-    yield from table([*titles, "seeds in which D-BAT is above"], rows)
+    yield from table(["method", *lengths, *scores], rows)
     yield "All rooms, at the mean of both lengths: the best member there, the paper's way.\n"
     yield from table(
         ["", "balanced accuracy", "accuracy", "the authors' (three seeds)"],
@@ -188,9 +189,9 @@ def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
 def _cross_fitted(numbers: Numbers, method: str) -> list[str]:
     seeds = numbers[method]
     rankings, dbat = crossed(seeds, "ranking"), crossed(numbers["dbat"], "ranking")
-    steps = f"{picked(seeds, 'first')}, {picked(seeds, 'second')}"
+    steps = [str(picked(seeds, half)) for half in ("first", "second")]
     versus = ["-", "-"] if method == "dbat" else [interval(dbat - rankings), won(dbat - rankings)]
-    return [method, steps, interval(rankings), interval(crossed(seeds, "balanced_accuracy")), *versus]
+    return [TITLES[method], *steps, interval(rankings), interval(crossed(seeds, "balanced_accuracy")), *versus]
 
 
 def _all_rooms(groups: int, method: str, seeds: Seeds) -> list[str]:

@@ -18,6 +18,7 @@ from studies.cells import amount, parser_of, table
 from studies.ladder_options import LADDERS, Distances, best_mean_worst, read
 
 METHODS = {"holds-dbat": "D-BAT", "holds-none": "no diversity", "oracle": "true sub-goal"}
+CONTROL = "oracle"  # whose members are alike
 PARTS = {
     "holds-dbat": "D-BAT",
     "no-context": "without other surroundings",
@@ -38,38 +39,43 @@ GROUPS = {
 def tables(path: Path) -> Iterator[str]:
     """What the cells say, as lines of Markdown."""
     distances = read(path, 1)
-    yield "Distance to the nearest true base, RAM units: best / **mean** / worst member, mean over seeds.\n"
+    yield "Distance to the nearest true base, RAM units, mean over seeds.\n"
     rows = []
     for ladder in (*LADDERS, *ON_BASES):
-        rows.append([ladder, *(_bold(distances.get((method, ladder), {})) for method in METHODS)])
-    yield from table(["ladder", *(_titled(distances, method) for method in METHODS)], rows)
+        stops = [stop for method in METHODS for stop in _stops(method, distances.get((method, ladder), {}))]
+        rows.append([ladder, *stops])
+    yield from table(["ladder", *(title for method in METHODS for title in _titles(distances, method))], rows)
     yield "Mean member, mean over ladders with a 95 % interval over the seeds that have all of these ladders.\n"
     rows = []
     for method, title in METHODS.items():
         rows.append([title, *(amount(_values(_of_group(distances, method, each)), 1) for each in GROUPS.values())])
     rows.append(["no diversity minus D-BAT, same seeds", *(_gap(distances, each) for each in GROUPS.values())])
     yield from table(["", *GROUPS], rows)
-    yield "Each part left out: best / **mean** / worst member, mean over the same seeds.\n"
+    yield "Each part left out: the mean member, mean over the same seeds.\n"
     cells = {(method, ladder): distances[method, ladder] for method in PARTS for ladder in OF_PARTS}
     shared = set.intersection(*map(set, cells.values()))
     rows = []
     for method, title in PARTS.items():
         of_method = [{seed: cells[method, ladder][seed] for seed in shared} for ladder in OF_PARTS]
-        rows.append([title, *map(_bold, of_method)])
+        rows.append([title, *(f"{best_mean_worst(seeds)[1]:.1f}" for seeds in of_method)])
     yield from table(["", *OF_PARTS], rows)
 
 
-def _bold(seeds: dict[int, NDArray[np.float64]]) -> str:
+def _stops(method: str, seeds: dict[int, NDArray[np.float64]]) -> list[str]:
+    """Write a method's cells of one ladder: the best, the mean and the worst member, the mean in bold."""
     if not seeds:
-        return "-"
+        return ["-"] * (1 if method == CONTROL else 3)
     best, mean, worst = best_mean_worst(seeds)
-    return f"**{mean:.1f}**" if best == worst else f"{best:.1f} / **{mean:.1f}** / {worst:.1f}"
+    return [f"**{mean:.1f}**"] if method == CONTROL else [f"{best:.1f}", f"**{mean:.1f}**", f"{worst:.1f}"]
 
 
-def _titled(distances: Distances, method: str) -> str:
-    """A method and how many seeds each of its ladders has."""
-    counts = {len(seeds) for (name, _), seeds in distances.items() if name == method}
-    return f"{METHODS[method]} (seeds: {', '.join(map(str, sorted(counts)))})"
+def _titles(distances: Distances, method: str) -> list[str]:
+    """Name a method's columns, the first with the number of seeds that each of its ladders has."""
+    counts = sorted({len(seeds) for (name, _), seeds in distances.items() if name == method})
+    title = f"{METHODS[method]} ({', '.join(map(str, counts))} seed{'s' if counts != [1] else ''})"
+    if method == CONTROL:
+        return [title]
+    return [f"{title}, best", *(f"{METHODS[method]}, {which}" for which in ("mean", "worst"))]
 
 
 def _of_group(distances: Distances, method: str, ladders: tuple[str, ...]) -> dict[int, float]:

@@ -366,8 +366,9 @@ def _table(rows: list[dict[str, str]]) -> Iterator[str]:
         ratios = np.array([numbers[layout] / first[layout] for layout in numbers])
         shares = [_mean(own, quantity) for quantity in QUANTITIES[:-1]]
         shown.append([title, *_summary(values), amount(ratios, 1), *shares, _steps(own)])
-    titles = ["", "arrived", "median", "mean", "most", "ratio, median", "1-10", "11-20", "21-50", "51-100"]
-    yield from table([*titles, "steps, median"], shown)
+    of_episodes = [f"solved of episodes {part}" for part in ("1-10", "11-20", "21-50", "51-100")]
+    until = ["episodes until then, median", "mean", "most", "times those of the first row, median"]
+    yield from table(["chooser", "agents that arrived", *until, *of_episodes, "steps to 95 of 100, median"], shown)
 
 
 def _mean(rows: list[dict[str, str]], quantity: str) -> str:
@@ -376,9 +377,10 @@ def _mean(rows: list[dict[str, str]], quantity: str) -> str:
 
 
 def _steps(rows: list[dict[str, str]]) -> str:
-    """The median steps to 95 of 100 episodes, practice included; inf where most do not arrive."""
+    """The median steps to 95 of 100 episodes, practice included; never where most do not arrive."""
     values = [float(row["steps_to_95"] or "inf") + float(row["practised"]) for row in rows]
-    return f"{np.median(values):,.0f}"
+    median = np.median(values)
+    return "never" if np.isinf(median) else f"{median:,.0f}"
 
 
 def _summary(values: NDArray[np.float64]) -> list[str]:

@@ -90,10 +90,11 @@ def tables(path: Path) -> Iterator[str]:
         weights = ", ".join(f"{weight:g}" for weight in np.unique(values_of(method, "weight")))
         both = f"{int(np.logical_and(*owned).sum())} of {len(seeds)}"
         lines.append([method, weights, both, *map(share, solved), share(mean_of[method])])
-        apart = mean_of["auto"] - mean_of[method]
-        lines[-1] += [amount(apart), won(apart)] if method != "auto" else ["-", "-"]
+        more = mean_of["auto"] - mean_of[method]
+        lines[-1] += [amount(more), won(more)] if method != "auto" else ["-", "-"]
     solved_by = [f"solved, {feature}" for feature in FEATURES]
-    names = ["", "weight", "both owned", *solved_by, "both", "auto minus it, median", "seeds"]
+    apart = ["auto solves more by, median", "seeds on which auto solves more"]
+    names = ["members", "weights chosen", "seeds with both owned", *solved_by, "solved, mean of both", *apart]
     yield ""
     yield from table(names, lines)
 

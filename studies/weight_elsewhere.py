@@ -166,9 +166,18 @@ def tables(path: Path) -> Iterator[str]:
             numbers = [np.array([float(row[column]) for row in cells]) for column in ("first", "second")]
             idle = sum(int(row["idle"]) for row in cells)
             told = ", ".join(f"{weight:g}" for weight in weights)
-            lines.append([f"{name}: {method}", told, *map(interval, numbers), str(idle), str(len(cells))])
+            lines.append([name, method, told, *map(interval, numbers), str(idle), str(len(cells))])
     yield ""
-    yield from table(["", "weight", "first", "second", "members that are none", "seeds"], lines)
+    titles = [
+        "data",
+        "method",
+        "weights chosen",
+        "first score",
+        "second score",
+        "members that are no hypothesis",
+        "seeds",
+    ]
+    yield from table(titles, lines)
 
 
 def main() -> None:

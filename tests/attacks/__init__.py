@@ -1,1 +1,1 @@
-"""The attack kit: kills and damaged files; docs/faults.md has what came of its long runs."""
+"""The attack kit: kills and damaged files; docs/errors.md has what came of its long runs."""

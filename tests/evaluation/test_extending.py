@@ -1,4 +1,4 @@
-"""examples/durations.py: a figure with its number is one file, its template and one line (docs/extending.md)."""
+"""examples/durations.py: a figure with its number is one file, its template and one line (docs/insides.md)."""
 
 import importlib
 import shutil
