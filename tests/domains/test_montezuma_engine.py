@@ -20,7 +20,7 @@ from hypogoal.domains.montezuma.emulator import (
     RIGHT,
     UP,
     Emulator,
-    stacked,
+    stack_frames,
 )
 from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, MontezumaLadder, arrives, make_starts
@@ -61,7 +61,7 @@ def test_start_states_are_at_the_top_and_live(emulator: Emulator) -> None:
     """Spec D4: distinct pictures of the top, alive, from each of which the scripted descent gets to the base."""
     ladder = BEGINNINGS["2-6"]
     starts = make_starts(emulator, "2-6", 6, seed=0)
-    assert len({stacked(start.seen).tobytes() for start in starts}) == 6
+    assert len({stack_frames(start.seen).tobytes() for start in starts}) == 6
     for start in starts:
         emulator.restore(start)
         assert emulator.position() == ladder.at
@@ -111,7 +111,7 @@ def test_an_episode_of_the_environment(env: MontezumaLadder) -> None:
 
 def test_start_states_are_drawn_or_asked_for(env: MontezumaLadder) -> None:
     """Spec D4: reset with a seed repeats, without draws all of them, and one can be asked for by number."""
-    looks = {stacked(start.seen).tobytes(): number for number, start in enumerate(env.starts)}
+    looks = {stack_frames(start.seen).tobytes(): number for number, start in enumerate(env.starts)}
     drawn = [looks[env.reset(seed=seed)[0].tobytes()] for seed in (5, 5)]
     assert drawn[0] == drawn[1]
     assert {looks[env.reset()[0].tobytes()] for _ in range(40)} == set(range(STARTS))
@@ -162,7 +162,7 @@ def test_ids_images_and_positions(engine: MontezumaEngine) -> None:
     assert contract.observation_shape == OBSERVATION_SHAPE
     assert set(engine.reset()) <= set(range(STARTS))
     starts = engine.images(np.arange(STARTS))
-    assert np.array_equal(starts, np.stack([stacked(start.seen) for start in engine.starts]))
+    assert np.array_equal(starts, np.stack([stack_frames(start.seen) for start in engine.starts]))
     assert engine.positions(np.arange(STARTS)).tolist() == [[1, 21, 192]] * STARTS
     before, first = engine.ids, engine.n_states
     shown = [engine.images(before)]
@@ -188,12 +188,12 @@ def test_old_states_are_forgotten() -> None:
     """Images of the newest ``memory`` states and of the start states are kept; positions and labels of all."""
     engine = MontezumaEngine("1L", 2, start_states=2, memory=20)
     shown, positions = [engine.images(np.arange(2))], [engine.positions(np.arange(2))]
-    known = [engine.facts_of(np.arange(2))]
+    known = [engine.read_facts(np.arange(2))]
     for number in range(40):
         step = engine.step(np.array([DOWN, UP] if number < 9 else [NOOP, DOWN]))
         shown.append(engine.images(step.next_ids))
         positions.append(engine.positions(step.next_ids))
-        known.append(engine.facts_of(step.next_ids))
+        known.append(engine.read_facts(step.next_ids))
         assert engine.oldest == max(2, engine.n_states - 20)
     images = np.concatenate(shown)
     for keep in (np.arange(2), np.arange(engine.oldest, engine.n_states)):
