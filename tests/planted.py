@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
-from hypogoal.domains.doorkey.env import layout_of
+from hypogoal.domains.doorkey.env import make_layout
 from hypogoal.options.termination import Terminations
 
 
@@ -12,7 +12,7 @@ def planted(engine: DoorKeyEngine) -> Terminations:
     """Fifteen hypotheses that agree where the agent holds one key at a time, in the order blue, green, red, on one
     layout: keys by colour, by the cell that is empty, by how many are gone; wrong doors and wrong goals.
     """
-    layout = layout_of(engine.layouts.seeds[0])
+    layout = make_layout(engine.layouts.seeds[0])
     cells = np.array(layout.keys)[[1, 2, 0]]  # each key's "own" cell is another's
 
     def classify(ids: NDArray[np.int64]) -> NDArray[np.bool_]:

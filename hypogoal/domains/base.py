@@ -100,7 +100,7 @@ class Engine(Resumable, ABC):
         starts: its start states, with ids 0 .. S - 1, never forgotten; empty where all episodes begin alike.
         position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
         layouts: where episodes begin; None: all in one layout.
-        restarts: whether it has :meth:`restart`.
+        restarts: whether it has :meth:`restart`, or what this needs.
         resumes: whether :meth:`snapshot` has all that the next steps need.
     """
 
@@ -144,7 +144,20 @@ class Engine(Resumable, ABC):
         """True sub-goal predicates, bool (n, G): an oracle, for evaluation and the upper bound only."""
 
     def restart(self, where: Bools) -> None:
-        """Begin a new episode in the environments ``where``, bool (E,); needs ``restarts``."""
+        """Begin a new episode in the environments ``where``, bool (E,); needs ``restarts``. Uses ``_begin`` by default.
+
+        The arrays of before stay as they are.
+        """
+        [numbers] = where.nonzero()
+        if not len(numbers):  # in most steps
+            return
+        self.ids = self.ids.copy()
+        self.elapsed = np.where(where, 0, self.elapsed)
+        for number in numbers.tolist():
+            self.ids[number] = self._begin(number)
+
+    def _begin(self, number: int) -> int:
+        """Begin an episode in one environment; returns the start state."""
         raise NotImplementedError
 
     @property
@@ -216,17 +229,22 @@ class TurnEngine(Engine):
     def oldest(self) -> int:
         return max(len(self.starts), self.n_states - self.room)
 
-    def _add(self, seen: Any, facts: NDArray[Any]) -> int:
+    @property
+    def kept(self) -> list[int]:
+        """The states of which it keeps what it saw, in order."""
+        return [*range(len(self.starts)), *range(self.oldest, self.n_states)]
+
+    def _add(self, seen: Any, facts: bytes) -> int:
         """Keep what was seen in a new state, and its facts; returns its id."""
         state = self.n_states
         self._seen[state] = seen
-        self._facts += facts.tobytes()
+        self._facts += facts
         forgotten = state - self.room
         if forgotten >= len(self.starts):
             del self._seen[forgotten]
         return state
 
-    def facts_of(self, ids: Ints) -> Bytes:
+    def read_facts(self, ids: Ints | Sequence[int]) -> Bytes:
         """The facts of states, uint8 (n, ``width``), also of forgotten ones."""
         every = np.frombuffer(self._facts, np.uint8)
         return every.reshape(-1, self.width)[ids]
@@ -252,17 +270,8 @@ class TurnEngine(Engine):
         self._facts = bytearray(snapshot["facts"].tobytes())
 
     @abstractmethod
-    def _begin(self, number: int) -> int:
-        """Begin an episode in one environment; returns the start state."""
-
-    @abstractmethod
     def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
         """Step ``elapsed`` of one environment's episode: what a :class:`Step` says of it."""
-
-    def restart(self, where: Bools) -> None:
-        self.ids, self.elapsed = self.ids.copy(), np.where(where, 0, self.elapsed)
-        for number in np.flatnonzero(where).tolist():
-            self.ids[number] = self._begin(number)
 
     def step(self, actions: Ints) -> Step:
         elapsed = [steps + 1 for steps in self.elapsed.tolist()]

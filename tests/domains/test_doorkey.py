@@ -10,9 +10,9 @@ from minigrid.wrappers import RGBImgObsWrapper
 
 from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
-from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig, _grid_of
+from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig, _make_grid
 from hypogoal.domains.doorkey.engine import DROP, FORWARD, LEFT, PICKUP, TOGGLE
-from hypogoal.domains.doorkey.env import SUB_GOALS, DoorKeyEnv, DoorKeyGrid, layout_of
+from hypogoal.domains.doorkey.env import SUB_GOALS, DoorKeyEnv, DoorKeyGrid, make_layout
 
 SAME_GRID = (90, 103)  # layout seeds whose grids are the same
 
@@ -28,9 +28,9 @@ def corner() -> DoorKeyEnv:
     """The agent in a corner, facing right, no keys in the room, the locked red door three cells ahead."""
     env = DoorKeyEnv(layout_seed=0)
     env.reset()
-    for cell in layout_of(0).keys:
+    for cell in make_layout(0).keys:
         env.grid.set(cell % 8, cell // 8, None)
-    door = layout_of(0).door
+    door = make_layout(0).door
     env.grid.set(door % 8, door // 8, env.grid.get(0, 0))
     env.grid.set(4, 1, env.door)
     env.agent_pos, env.agent_dir = (1, 1), 0
@@ -59,7 +59,7 @@ def test_layouts_follow_minigrids_order() -> None:
     for seed in range(40):
         stock.reset(seed=seed)
         cells = {thing.type: index for index, thing in enumerate(stock.grid.grid) if thing is not None}
-        layout = layout_of(seed)
+        layout = make_layout(seed)
         assert (cells["door"], cells["goal"], cells["key"]) == (layout.door, layout.goal, layout.keys[2])
         assert (stock.agent_pos[0], stock.agent_pos[1]) == (layout.start % 8, layout.start // 8)
         assert stock.agent_dir == layout.direction
@@ -124,7 +124,7 @@ def test_any_held_key_opens_and_nothing_locks_again(corner: DoorKeyEnv) -> None:
     locked = DoorKeyEnv(layout_seed=0)
     locked.reset()
     locked.ring = [Key("blue"), Key("green")]
-    locked.agent_pos, locked.agent_dir = ((layout_of(0).door % 8) - 1, layout_of(0).door // 8), 0
+    locked.agent_pos, locked.agent_dir = ((make_layout(0).door % 8) - 1, make_layout(0).door // 8), 0
     assert not act(locked, TOGGLE)["open-red-door"]
 
 
@@ -175,7 +175,7 @@ def test_origins_say_where_the_agent_is(fixed: Collected) -> None:
         origin = {name: int(values[index]) for name, values in data.origins.items()}
         env.agent_pos, env.agent_dir = (origin["agent_x"], origin["agent_y"]), origin["direction"]
         env.door.is_open, env.door.is_locked = origin["door_state"] == 0, origin["door_state"] == 2
-        for bit, cell in enumerate(layout_of(0).keys):
+        for bit, cell in enumerate(make_layout(0).keys):
             if origin["keys_held"] >> bit & 1:
                 env.grid.set(cell % 8, cell // 8, None)
         assert np.array_equal(env.gen_obs(), data.observations[index])
@@ -186,7 +186,7 @@ def test_held_out_layouts_are_new() -> None:
     near = collected(heldout_first=0, heldout_layouts=3)
     assert sorted(set(near.heldout.origins["layout_seed"])) == [3, 4, 5]
     first, twin = SAME_GRID
-    assert _grid_of(first) == _grid_of(twin)
+    assert _make_grid(first) == _make_grid(twin)
     for settings in ({"labelled_seed": first}, {"unlabelled_seeds": (first,)}):
         data = collected(heldout_first=twin, heldout_layouts=1, **settings)
         assert set(data.heldout.origins["layout_seed"]) == {twin + 1}

@@ -19,7 +19,7 @@ MAX_STEPS = 50
 
 def shortest_actions(engine: DoorKeyEngine) -> list[int]:
     """A shortest way to the goal, walked back from it."""
-    ids, steps = engine.distances()
+    ids, steps, _ = engine.search()
     goal = int(np.argmax(engine.at_goal(ids)))
     target, actions = int(ids[goal]), []
     for depth in range(int(steps[goal]) - 1, -1, -1):
@@ -177,7 +177,7 @@ def test_a_corridor_counted_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
 
     Key lying 4, held and locked 8, held and open 12 + 1 on the goal, held and closed 8.
     """
-    monkeypatch.setattr("hypogoal.domains.doorkey.engine.layout_of", lambda seed: corridor())
+    monkeypatch.setattr("hypogoal.domains.doorkey.engine.make_layout", lambda seed: corridor())
     engine = DoorKeyEngine(0)
     assert engine.shortest_path() == 5
     assert shortest_actions(engine) == [PICKUP, FORWARD, TOGGLE, FORWARD, FORWARD]

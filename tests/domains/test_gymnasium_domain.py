@@ -187,12 +187,12 @@ def test_an_environment_may_reuse_its_array() -> None:
 def test_no_state_of_a_layout_is_favoured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten of a hundred states, a hundred times: of each tenth of the way 100 are expected, with a deviation of 9."""
     way = [(np.array([step], np.float32), (0, 0, step)) for step in range(100)]
-    monkeypatch.setattr(play, "played", lambda *_: iter(way))
+    monkeypatch.setattr(play, "play_layout", lambda *_: iter(way))
     nothing = {"policies": (None,), "label_functions": {}, "sub_goals": (), "origins": {}}
     domain: Any = SimpleNamespace(reader=reader_of(spaces.Box(0, 99, (1,), np.float32)), **nothing)
     counts = np.zeros(10)
     for seed in range(100):
         rng = np.random.default_rng(seed)
-        for state in play.sampled(domain, None, 0, GymnasiumConfig(states=10), set(), rng, by_features=False):
+        for state in play.sample_layout(domain, None, 0, GymnasiumConfig(states=10), set(), rng, by_features=False):
             counts[state.origin[-1] // 10] += 1
     assert counts.sum() == 1000 and (np.abs(counts - 100) < 4 * 9).all(), counts

@@ -16,9 +16,9 @@ from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma import states as montezuma_states
 from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig
 from hypogoal.domains.montezuma.emulator import DYING, JUMP, POSE, ROOM, ROOMS, X, Y
-from hypogoal.domains.montezuma.expert import Expert, Shown, standing_places
+from hypogoal.domains.montezuma.expert import Expert, Shown, find_standing_places
 from hypogoal.domains.montezuma.ladders import BASES, LADDERS, TOPS
-from hypogoal.domains.montezuma.states import HELD_OUT_EACH, KINDS, POSITIVE, choose, gather, states_of
+from hypogoal.domains.montezuma.states import HELD_OUT_EACH, KINDS, POSITIVE, choose, describe_states, gather
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
 from hypogoal.observations import digest
 
@@ -128,7 +128,7 @@ def test_kinds() -> None:
         facts = np.zeros(len(game.FACTS), np.uint8)
         facts[[ROOM, X, Y, DYING, POSE, JUMP]] = values
         shown.append(Shown(np.zeros(game.OBSERVATION_SHAPE, np.uint8), facts, 0, 0))
-    states = states_of(shown, [CLIMB_DOWN])
+    states = describe_states(shown, [CLIMB_DOWN])
     assert [KINDS[kind] for kind in states.origins["kind"]] == [kind for _, kind in rows]
     assert states.labels[:, 0].tolist() == [True] + [False] * 9
 
@@ -160,7 +160,7 @@ def test_agents_are_put_where_one_can_stand() -> None:
     emulator = game.Emulator()
     rng = np.random.default_rng(0)
     for room in range(ROOMS):
-        places = standing_places(emulator, room)
+        places = find_standing_places(emulator, room)
         shafts = [top.x for top in TOPS if top.room == room]
         free = places[[min((abs(x - shaft) for shaft in shafts), default=99) > 8 for x in places[:, 0]]]
         for x, y in rng.permutation(free)[:3].tolist():

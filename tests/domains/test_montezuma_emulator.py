@@ -27,7 +27,7 @@ from hypogoal.domains.montezuma.emulator import (
     Emulator,
     Position,
     Snapshot,
-    row_of,
+    find_row,
 )
 
 pytestmark = pytest.mark.atari
@@ -151,7 +151,7 @@ def test_the_agent_can_be_put_into_every_room(emulator: Emulator, another: Emula
     assert emulator.position().room == room
     assert emulator.alive()
     assert emulator.read("inventory") & TORCH
-    assert emulator.read("row") == row_of(room)
+    assert emulator.read("row") == find_row(room)
     lit = (emulator.ale.getScreenRGB().max(axis=2) > 0).mean()
     assert lit > 0.15
     if room >= 16:  # dark without the torch

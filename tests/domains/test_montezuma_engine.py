@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma import env as montezuma_env
 from hypogoal.domains.montezuma.domain import DOMAIN
-from hypogoal.domains.montezuma.emulator import DOWN, N_ACTIONS, NOOP, OBSERVATION_SHAPE, RIGHT, UP, Emulator, stacked
+from hypogoal.domains.montezuma.emulator import (
+    DOWN,
+    N_ACTIONS,
+    NOOP,
+    OBSERVATION_SHAPE,
+    RIGHT,
+    UP,
+    Emulator,
+    stack_frames,
+)
 from hypogoal.domains.montezuma.engine import MontezumaEngine
 from hypogoal.domains.montezuma.env import BEGINNINGS, MontezumaLadder, arrives, make_starts
 from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN
@@ -50,7 +59,7 @@ def test_start_states_are_at_the_top_and_live(emulator: Emulator) -> None:
     """Spec D4: distinct pictures of the top, alive, from each of which the scripted descent gets to the base."""
     ladder = BEGINNINGS["2-6"]
     starts = make_starts(emulator, "2-6", 6, seed=0)
-    assert len({stacked(start.seen).tobytes() for start in starts}) == 6
+    assert len({stack_frames(start.seen).tobytes() for start in starts}) == 6
     for start in starts:
         emulator.restore(start)
         assert emulator.position() == ladder.at
@@ -82,7 +91,7 @@ def test_gymnasium_accepts_it() -> None:
 
 def test_start_states_are_drawn_or_asked_for(env: MontezumaLadder) -> None:
     """Spec D4: reset with a seed repeats, without draws all of them, and one can be asked for by number."""
-    looks = {stacked(start.seen).tobytes(): number for number, start in enumerate(env.starts)}
+    looks = {stack_frames(start.seen).tobytes(): number for number, start in enumerate(env.starts)}
     drawn = [looks[env.reset(seed=seed)[0].tobytes()] for seed in (5, 5)]
     assert drawn[0] == drawn[1]
     assert {looks[env.reset()[0].tobytes()] for _ in range(40)} == set(range(STARTS))
@@ -130,12 +139,12 @@ def test_old_states_are_forgotten() -> None:
     """Images of the newest ``memory`` states and of the start states are kept; positions and labels of all."""
     engine = MontezumaEngine("1L", 2, start_states=2, memory=20)
     shown, positions = [engine.images(np.arange(2))], [engine.positions(np.arange(2))]
-    known = [engine.facts_of(np.arange(2))]
+    known = [engine.read_facts(np.arange(2))]
     for number in range(40):
         step = engine.step(np.array([DOWN, UP] if number < 9 else [NOOP, DOWN]))
         shown.append(engine.images(step.next_ids))
         positions.append(engine.positions(step.next_ids))
-        known.append(engine.facts_of(step.next_ids))
+        known.append(engine.read_facts(step.next_ids))
         assert engine.oldest == max(2, engine.n_states - 20)
     images = np.concatenate(shown)
     for keep in (np.arange(2), np.arange(engine.oldest, engine.n_states)):

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hypogoal.domains.montezuma.emulator import DOWN, FIRST_ROOM_OF_ROW, LEFT, RIGHT, ROOMS, Emulator, row_of
+from hypogoal.domains.montezuma.emulator import (
+    DOWN,
+    FIRST_ROOM_OF_ROW,
+    LEFT,
+    RIGHT,
+    ROOMS,
+    Emulator,
+    find_row,
+)
 from hypogoal.domains.montezuma.ladders import (
     BASES,
     LADDERS,
@@ -73,7 +81,7 @@ def crosses(emulator: Emulator, room: int, x: int, action: int) -> bool:
 def test_walls_are_where_they_are(emulator: Emulator) -> None:
     """Spec F3: no way through at ``WALLS``; from every other room of the pyramid's lower three rows one to the left."""
     for left in range(3, ROOMS - 1):
-        if row_of(left) == row_of(left + 1):
+        if find_row(left) == find_row(left + 1):
             assert crosses(emulator, left + 1, 8, LEFT) == ((left, left + 1) not in WALLS), left
     for left, _ in WALLS:
         assert not crosses(emulator, left, 146, RIGHT)

@@ -1,17 +1,28 @@
 """Sub-goals of Montezuma's Revenge beyond the paper's: labels are compared with what the emulator forces."""
 
+import runpy
 from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig, rooms_of
+from hypogoal.core.errors import UserError
+from hypogoal.domains.montezuma import sub_goals
+from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig, choose_rooms
 from hypogoal.domains.montezuma.emulator import DOWN, FACTS, LEFT, NOOP, ROOMS, SPRITE_TOP, UP, Emulator
 from hypogoal.domains.montezuma.env import BEGINNINGS, arrives, make_starts
 from hypogoal.domains.montezuma.ladders import BASES, LADDERS, TOPS, Ladder
 from hypogoal.domains.montezuma.states import gather
-from hypogoal.domains.montezuma.sub_goals import CLIMB_DOWN, ENEMIES, GATES, LASER_Y, SUB_GOALS, labels_of
+from hypogoal.domains.montezuma.sub_goals import (
+    CLIMB_DOWN,
+    ENEMIES,
+    GATES,
+    LABELLED_ROOMS,
+    LASER_Y,
+    SUB_GOALS,
+    judge_sub_goals,
+)
 from hypogoal.meta.nearness import distances_of
 
 pytestmark = pytest.mark.atari
@@ -30,7 +41,7 @@ def emulator() -> Emulator:
 
 def holding(emulator: Emulator) -> set[str]:
     """The sub-goals that hold now, by the console's memory."""
-    [labels] = labels_of(emulator.facts()[None], SUB_GOALS.values())
+    [labels] = judge_sub_goals(emulator.facts()[None], SUB_GOALS.values())
     return {name for name, holds in zip(SUB_GOALS, labels, strict=True) if holds}
 
 
@@ -131,7 +142,7 @@ def test_lasers_kill_beside_the_places(emulator: Emulator, room: int) -> None:
 def test_each_sub_goal_is_collected_alone(name: str) -> None:
     """A tenth of the labelled states or more are positive; unlabelled rooms have the sub-goal, or not."""
     goal = SUB_GOALS[name]
-    labelled, unlabelled = rooms_of(MontezumaConfig(sub_goals=(name,)))
+    labelled, unlabelled = choose_rooms(MontezumaConfig(sub_goals=(name,)))
     for room in labelled:
         assert 4 <= gather("labelled", room, 40, 3, [goal]).labels.sum() <= 30
     clear = {place.room for index, place in enumerate(goal.places) if index not in goal.unclear}
@@ -165,3 +176,10 @@ def test_distances_are_those_of_the_sub_goal() -> None:
         assert not DOMAIN.distance_to(name, np.array(goal.places)).any()
     away = distances_of(DOMAIN, ["climb-down-ladder", "climb-up-ladder"], 2)  # options 0, 1 down, 2, 3 up
     assert away(np.repeat(top, 4, axis=0), np.arange(4)).tolist() == [44, 44, 0, 0]
+
+
+def test_a_sub_goal_without_rooms_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever adds a sub-goal is told what ``measured.toml`` lacks."""
+    monkeypatch.delitem(LABELLED_ROOMS, "pass-lasers")
+    with pytest.raises(UserError, match=r"lacks its rooms: pass-lasers\. Add \[rooms\.pass-lasers\]"):
+        runpy.run_path(sub_goals.__file__)

@@ -20,7 +20,7 @@ from hypogoal.domains.rooms.states import (
     OBJECT,
     TILE,
     crossed_states,
-    image_of,
+    draw_pictures,
     labelled_states,
     tiles,
     unlabelled_states,
@@ -45,7 +45,7 @@ def test_a_scene_is_drawn_as_minigrid_draws_it() -> None:
     grid.set(4, 3, Ball("red"))
     ids = np.full((1, CELLS), FLOOR)
     ids[0, 0], ids[0, 2 * INNER + 3], ids[0, INNER + 1] = OBJECT + 1, OBJECT + 2, AGENT + 3
-    assert (image_of(ids)[0] == grid.render(TILE, (2, 2), 3)).all()
+    assert (draw_pictures(ids)[0] == grid.render(TILE, (2, 2), 3)).all()
     assert (tiles()[1] == Grid.render_tile(Wall(), tile_size=TILE).astype(np.uint8)).all()
 
 

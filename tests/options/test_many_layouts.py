@@ -32,6 +32,8 @@ def drawn(seeds: tuple[int, ...] = SEEDS) -> Layouts:
 
 
 def corridors(layouts: int | Layouts, count: int) -> Engine:
+    if isinstance(layouts, int):
+        return corridor_env.DOMAIN.make_engine(layouts, count, 9)
     return corridor_env.DOMAIN.make_engine(0, count, 9, layouts=layouts)
 
 

@@ -121,7 +121,7 @@ def test_a_classifier_that_confuses_keys_is_fooled_by_the_other_key(tmp_path: Pa
     assert {(row["option"], row["reached"], row["near"]) for row in rows} == {("0", "1", "0"), ("1", "1", "1")}
 
     engine = DoorKeyEngine(int(BLUE_FIRST))
-    ids, away = engine.distances()
+    ids, away, _ = engine.search()
     with Image.open(out / film) as drawn:
         assert drawn.n_frames == away[engine.labels(ids)[:, 0]].min() + 1, "from where it began"
     artefact = open_artefact(out, "audit")

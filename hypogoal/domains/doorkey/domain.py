@@ -44,18 +44,18 @@ class DoorKeyConfig(Config):
     )
 
 
-def _grid_of(layout_seed: int) -> env.GridLayout:
+def _make_grid(layout_seed: int) -> env.GridLayout:
     """A layout without its agent: those with the same grid have the same states."""
-    return replace(env.layout_of(layout_seed), start=0, direction=0)
+    return replace(env.make_layout(layout_seed), start=0, direction=0)
 
 
 def _heldout_seeds(config: DoorKeyConfig) -> list[int]:
     """The first layout seeds from ``heldout_first`` on whose grids are new."""
-    grids = set(map(_grid_of, (config.labelled_seed, *config.unlabelled_seeds)))
+    grids = set(map(_make_grid, (config.labelled_seed, *config.unlabelled_seeds)))
     chosen: list[int] = []
     layout_seed = config.heldout_first
     while len(chosen) < config.heldout_layouts:
-        grid = _grid_of(layout_seed)
+        grid = _make_grid(layout_seed)
         if grid not in grids:
             grids.add(grid)
             chosen.append(layout_seed)

@@ -26,10 +26,10 @@ from hypogoal.domains.doorkey.env import (
     MAX_STEPS,
     OBSERVATION_SHAPE,
     SIZE,
-    layout_of,
-    sub_goals_reached,
+    judge_sub_goals,
+    make_layout,
 )
-from hypogoal.domains.tiles import TILE, drawn_tiles
+from hypogoal.domains.tiles import TILE, draw_tiles
 
 N_ACTIONS = len(Actions)
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = map(int, Actions)
@@ -78,7 +78,7 @@ PER_STATE = (
     "_final",
 )
 PER_CONFIGURATION = (
-    "_places",
+    "_configurations",
     "_bare_codes",
     "_id_at",
 )
@@ -94,7 +94,7 @@ def tiles() -> Bytes:
     doors = [open_door, Door(DOOR_COLOUR), Door(DOOR_COLOUR, is_locked=True)]
     objects = [None, Wall(), goal, *keys, *doors]
     with_agent = product((None, open_door, goal), range(4))
-    table = drawn_tiles([*product(objects, [None]), *with_agent])
+    table = draw_tiles([*product(objects, [None]), *with_agent])
     table.flags.writeable = False
     return table
 
@@ -125,9 +125,8 @@ class DoorKeyEngine(Engine):
         self.harsh = wrong_key == "ends"
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self._numbers: dict[Configuration, int] = {}
-        self._configurations: list[Configuration] = []  # by number
-        # For each configuration: the door's state and the keys' places; its cell codes without the agent; ids by pose.
-        self._places = np.zeros((16, 4), np.uint8)
+        # For each configuration: itself; its cell codes without the agent; ids by pose.
+        self._configurations = np.zeros((16, 5), int)
         self._bare_codes = np.zeros((16, CELLS), np.uint8)
         self._id_at = np.full((16, POSES), UNKNOWN, int)
         # For each id: configuration * POSES + pose; the index of the cell ahead in the bare codes; cell codes; the
@@ -146,25 +145,19 @@ class DoorKeyEngine(Engine):
     def tiles(self) -> Bytes:
         return tiles()
 
-    def restart(self, where: Bools) -> None:
-        [numbers] = where.nonzero()
-        if not len(numbers):  # in most steps
-            return
-        self.ids = self.ids.copy()
-        self.elapsed = np.where(where, 0, self.elapsed)
-        for number in numbers.tolist():
-            seed = self.layouts.begin(number)
-            self.ids[number] = self._start(seed)
+    def _begin(self, number: int) -> int:
+        seed = self.layouts.begin(number)
+        return self._find_start(seed)
 
-    def _start(self, seed: int) -> int:
+    def _find_start(self, seed: int) -> int:
         """The start state of a layout."""
-        layout = layout_of(seed)
-        configuration = self._number_of((seed, LOCKED, *layout.keys))
+        layout = make_layout(seed)
+        configuration = self._enter_configuration((seed, LOCKED, *layout.keys))
         pose = layout.start * 4 + layout.direction
-        return self._id_of(configuration * POSES + pose)
+        return self._enter_state(configuration * POSES + pose)
 
-    def _starts_of(self, seeds: Sequence[int]) -> Ints:
-        return np.array([self._start(seed) for seed in seeds])
+    def _find_starts(self, seeds: Sequence[int]) -> Ints:
+        return np.array([self._find_start(seed) for seed in seeds])
 
     def step(self, actions: Ints) -> Step:
         following = self.follow(self.ids, actions)
@@ -187,18 +180,18 @@ class DoorKeyEngine(Engine):
         [changing] = MAY_CHANGE.take(case).nonzero()
         for index in changing.tolist():
             action = int(actions[index])
-            changed = self._changed(site.item(index), action)
+            changed = self._change(site.item(index), action)
             following_site[index] = changed * POSES + pose.item(index)
         following = self._id_at.ravel().take(following_site)
         [new] = (following < 0).nonzero()
         for index in new.tolist():
-            following[index] = self._id_of(following_site.item(index))
+            following[index] = self._enter_state(following_site.item(index))
         return following
 
-    def _changed(self, site: int, action: int) -> int:
+    def _change(self, site: int, action: int) -> int:
         """The configuration after an action that ``MAY_CHANGE`` it: a key picked up or dropped, the door toggled."""
         configuration, pose = divmod(site, POSES)
-        seed, door, *keys = self._configurations[configuration]
+        seed, door, *keys = self._configurations[configuration].tolist()
         last = max(keys)
         if action == DROP and last < HELD:  # most drops of a random policy
             return configuration
@@ -213,7 +206,7 @@ class DoorKeyEngine(Engine):
                 door = CLOSED
             elif door == CLOSED or has_red_key:  # once unlocked it never locks again
                 door = OPEN
-        return self._number_of((seed, door, *keys))
+        return self._enter_configuration((seed, door, *keys))
 
     def images(self, ids: Ints) -> Bytes:
         strips = self._strips.take(ids, axis=0)
@@ -232,7 +225,7 @@ class DoorKeyEngine(Engine):
             if key not in self._strip_of:
                 strip = self._strip_of[key] = len(self._strip_of)
                 if strip == len(self._drawn):
-                    self._drawn = _doubled(self._drawn)
+                    self._drawn = lengthen(self._drawn)
                 cells = tiles()[codes[row]]  # (cell, y, x, colour)
                 self._drawn[strip] = cells.swapaxes(0, 1).ravel()
             state, place = divmod(row, SIZE)
@@ -248,12 +241,12 @@ class DoorKeyEngine(Engine):
 
     def labels(self, ids: Ints) -> Bools:
         """True sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
-        places = self._places[self._site.take(ids) // POSES]
-        door_open = places[:, 0] == OPEN
-        held = places[:, 1:] >= HELD
+        configurations = self._configurations[self._site.take(ids) // POSES]
+        door_open = configurations[:, 1] == OPEN
+        held = configurations[:, 2:] >= HELD
         ahead = self._ahead.take(ids)
         facing_door = self._bare_codes.ravel().take(ahead) >= DOOR
-        return sub_goals_reached(
+        return judge_sub_goals(
             held,
             door_open,
             facing_door,
@@ -267,49 +260,55 @@ class DoorKeyEngine(Engine):
         ``door_state`` is MiniGrid's (0 open, 1 closed, 2 locked); ``keys_held`` has bit 0 for the blue, 1 for
         the green, 2 for the red key.
         """
-        configuration, pose = np.divmod(self._site.take(ids), POSES)
+        number, pose = np.divmod(self._site.take(ids), POSES)
         cell, direction = np.divmod(pose, 4)
-        places = self._places[configuration]
+        configurations = self._configurations[number]
         return {
             "agent_x": cell % SIZE,
             "agent_y": cell // SIZE,
             "direction": direction,
-            "door_state": places[:, 0].astype(int),
-            "keys_held": (places[:, 1:] >= HELD) @ KEY_BITS,
+            "door_state": configurations[:, 1],
+            "keys_held": (configurations[:, 2:] >= HELD) @ KEY_BITS,
         }
 
-    def distances(self, starts: Ints | None = None) -> tuple[Ints, Ints]:
-        """Breadth-first search: ids of all states reachable from the starts, nearest first, and the steps to each.
+    def search(self, starts: Ints | None = None) -> tuple[Ints, Ints, Ints]:
+        """Search breadth-first for all states reachable from ``starts``, ids (n,), by default those of all layouts.
 
-        ``starts`` are ids (n,), by default those of all layouts.
+        Returns their ids, nearest first, int64 (N,); the steps to each, int64 (N,); and the states after each action of
+        ``SEARCHED``, int64 (N, A).
 
-        The search stops at states in which the episode ends. It never drops a key: that leaves a few thousand states
-        per layout instead of some ten million.
+        The search stops at states in which the episode ends: these follow themselves. It never drops a key: that leaves
+        a few thousand states per layout instead of some ten million.
         """
         if starts is None:
-            starts = self._starts_of(self.layouts.seeds)
+            starts = self._find_starts(self.layouts.seeds)
         frontier = starts
         rings: list[Ints] = []
+        ways: list[Ints] = []
         seen = np.zeros(self.n_states, bool)
         seen[starts] = True
         while len(frontier):
+            going_on = ~self._final[frontier]
+            following = np.repeat(frontier[:, None], len(SEARCHED), axis=1)
+            origin = following[going_on]
+            actions = np.broadcast_to(SEARCHED, origin.shape)
+            reached = self.follow(origin.ravel(), actions.ravel())
+            following[going_on] = reached.reshape(origin.shape)
             rings.append(frontier)
-            going_on = frontier[~self._final[frontier]]
-            origin = np.repeat(going_on, len(SEARCHED))
-            actions = np.tile(SEARCHED, len(going_on))
-            following = np.unique(self.follow(origin, actions))
+            ways.append(following)
             seen.resize(self.n_states, refcheck=False)  # with False for new states
-            frontier = following[~seen[following]]
+            nearest = np.unique(reached)
+            frontier = nearest[~seen[nearest]]
             seen[frontier] = True
         steps = np.repeat(np.arange(len(rings)), [*map(len, rings)])
-        return np.concatenate(rings), steps
+        return np.concatenate(rings), steps, np.concatenate(ways)
 
     def reachable(self) -> Ints:
         """Ids of all states reachable from the start, nearest first, one for each image.
 
         States that differ only in the order of the keys on the ring look the same; the first represents them all.
         """
-        ids, _ = self.distances()
+        ids, *_ = self.search()
         codes = self.codes(ids)
         looks = codes.view(f"V{CELLS}")[:, 0]
         _, first = np.unique(looks, return_index=True)
@@ -317,36 +316,27 @@ class DoorKeyEngine(Engine):
 
     def plan(self, starts: Ints | None = None) -> Plan:
         """The transitions between all states, except some ten million that only dropping a key leads to."""
-        ids, _ = self.distances(starts)
-        final = self._final[ids]
-        going_on = ids[~final]
-        following = np.repeat(ids[:, None], len(SEARCHED), axis=1)
-        for column, action in enumerate(SEARCHED):
-            actions = np.full(len(going_on), action)
-            following[~final, column] = self.follow(going_on, actions)
-        solved = self.at_goal(ids)
+        ids, _, following = self.search(starts)
         return Plan(
             ids,
             SEARCHED,
             following,
-            final,
-            solved,
+            final=self._final[ids],
+            solved=self.at_goal(ids),
         )
 
     def shortest_path(self) -> int | None:
         """The fewest primitive steps to the goal; None with several layouts, or if only a wrong key clears the way."""
         if self.layouts.many:
             return None
-        ids, steps = self.distances()
+        ids, steps, _ = self.search()
         to_goal = steps[self.at_goal(ids)]
         return int(to_goal.min()) if len(to_goal) else None
 
     def random_success(self, episodes: int, rng: Generator) -> float:
         """The share of ``episodes`` of uniform-random actions that reach the goal within ``max_steps``."""
-        seeds = self.layouts.seeds * episodes
-        if self.layouts.many:
-            seeds = rng.choice(self.layouts.seeds, episodes).tolist()
-        ids = self._starts_of(seeds)
+        seeds = rng.choice(self.layouts.seeds, episodes)
+        ids = self._find_starts(seeds.tolist())
         solved = 0
         for _ in range(self.max_steps):
             actions = rng.integers(N_ACTIONS, size=len(ids))
@@ -359,19 +349,19 @@ class DoorKeyEngine(Engine):
         """All that a resumed run needs: each environment's state, and the ids assigned so far."""
         return {
             **super().snapshot(),
-            "configurations": np.array(self._configurations),
+            "configurations": self._configurations[: len(self._numbers)].copy(),
             "sites": self._site[: self.n_states].copy(),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Continue from a ``snapshot`` of an engine made with the same arguments; call it before the first step."""
         for configuration in snapshot["configurations"].tolist():
-            self._number_of(tuple(configuration))
+            self._enter_configuration(tuple(configuration))
         for site in snapshot["sites"].tolist():
-            self._id_of(site)
+            self._enter_state(site)
         super().restore(snapshot)
 
-    def _id_of(self, site: int) -> int:
+    def _enter_state(self, site: int) -> int:
         """The id of a state, a new one if it has none."""
         state = self._id_at.item(site)
         if state != UNKNOWN:
@@ -387,7 +377,7 @@ class DoorKeyEngine(Engine):
         codes[cell] = AGENT_ON.item(under) + direction
         self._site[new] = site
         self._ahead[new] = configuration * CELLS + AHEAD.item(pose)
-        _, _, blue, green, _ = self._configurations[configuration]
+        _, _, blue, green, _ = self._configurations[configuration].tolist()
         at_goal = under == GOAL
         self._on_goal[new] = at_goal
         is_wrong = self.harsh and max(blue, green) >= HELD
@@ -396,16 +386,16 @@ class DoorKeyEngine(Engine):
         self.n_states += 1
         return new
 
-    def _number_of(self, configuration: Configuration) -> int:
+    def _enter_configuration(self, configuration: Configuration) -> int:
         """The number of a configuration, a new one if it has none."""
         number = self._numbers.get(configuration)
         if number is not None:
             return number
-        new = self._numbers[configuration] = len(self._configurations)
-        if new == len(self._places):
+        new = self._numbers[configuration] = len(self._numbers)
+        if new == len(self._configurations):
             self._double(PER_CONFIGURATION)
         seed, door, *keys = configuration
-        layout = layout_of(seed)
+        layout = make_layout(seed)
         row = bytearray(CELLS)  # faster than an array
         for cell in layout.walls:
             row[cell] = WALL
@@ -414,18 +404,17 @@ class DoorKeyEngine(Engine):
         for colour, place in enumerate(keys):
             if place < HELD:
                 row[place] = KEY + colour
-        self._configurations.append(configuration)
+        self._configurations[new] = configuration
         self._bare_codes[new] = np.frombuffer(row, np.uint8)
-        self._places[new] = door, *keys
         return new
 
     def _double(self, names: Sequence[str]) -> None:
         """Double the rows of these tables."""
         for name in names:
-            setattr(self, name, _doubled(getattr(self, name)))
+            setattr(self, name, lengthen(getattr(self, name)))
 
 
-def _doubled(table: Array) -> Array:
+def lengthen(table: Array) -> Array:
     """The table with twice as many rows; integers in the new ones are ``UNKNOWN``, bytes 0."""
     filling = UNKNOWN if table.dtype == int else 0
     return np.concatenate([table, np.full_like(table, filling)])

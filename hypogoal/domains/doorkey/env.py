@@ -30,11 +30,11 @@ WRONG_KEYS = ("harmless", "ends")
 MISSION = "use the red key to open the door and then get to the goal"
 
 
-def sub_goals_reached(
+def judge_sub_goals(
     held: Bools,
-    door_open: Bools,
-    facing_door: Bools,
-    on_goal: Bools,
+    door_open: Bools | bool,
+    facing_door: Bools | bool,
+    on_goal: Bools | bool,
     door_label: str,
 ) -> Bools:
     """The five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
@@ -60,7 +60,7 @@ class GridLayout:
     keys: tuple[int, int, int]  # the cells of the blue, the green and the red key
 
 
-def cell_of(place: Any) -> int:
+def number_cell(place: Any) -> int:
     """The cell at a place x, y."""
     x, y = place
     return int(y) * SIZE + int(x)
@@ -88,7 +88,7 @@ class DoorKeyGrid(MiniGridEnv):
         max_steps: steps after which an episode is truncated.
         layout_seed: the layout of every episode; None, the layout follows from ``reset(seed)``.
             ``layout_seed=s`` is the layout of ``reset(seed=s)``.
-        door_label: definition of ``open-red-door`` in ``info["labels"]``, see ``sub_goals_reached``.
+        door_label: definition of ``open-red-door`` in ``info["labels"]``, see ``judge_sub_goals``.
         wrong_key: whether an episode ``ends`` (terminated, reward 0) once the blue or the green key is held.
     """
 
@@ -133,12 +133,12 @@ class DoorKeyGrid(MiniGridEnv):
         self.put_obj(self.door, *door)
         keys = {}
         for colour in PLACING_ORDER:
-            keys[colour] = cell_of(self.place_obj(Key(colour), top=(0, 0), size=(split, height)))
+            keys[colour] = number_cell(self.place_obj(Key(colour), top=(0, 0), size=(split, height)))
         self.layout = GridLayout(
             walls=frozenset(cell for cell, content in enumerate(self.grid.grid) if isinstance(content, Wall)),
-            door=cell_of(door),
-            goal=cell_of(goal),
-            start=cell_of(self.agent_pos),
+            door=number_cell(door),
+            goal=number_cell(goal),
+            start=number_cell(self.agent_pos),
             direction=int(self.agent_dir),
             keys=(keys["blue"], keys["green"], keys["red"]),
         )
@@ -178,15 +178,12 @@ class DoorKeyGrid(MiniGridEnv):
     def labels(self) -> Bools:
         """The true predicates of the current state, bool (5,), in the order of ``SUB_GOALS``."""
         held = np.array([colour in self.held for colour in KEY_COLOURS])
-        facing = self.grid.get(*self.front_pos) is self.door
-        on_goal = isinstance(self.grid.get(*self.agent_pos), Goal)
-        door_open, facing_door, at_goal = np.array([self.door.is_open, facing, on_goal])
-        return sub_goals_reached(
+        return judge_sub_goals(
             held,
-            door_open,
-            facing_door,
-            at_goal,
-            self.door_label,
+            door_open=self.door.is_open,
+            facing_door=self.grid.get(*self.front_pos) is self.door,
+            on_goal=isinstance(self.grid.get(*self.agent_pos), Goal),
+            door_label=self.door_label,
         )
 
     def _named_labels(self) -> dict[str, bool]:
@@ -211,7 +208,7 @@ class DoorKeyEnv(DoorKeyGrid):
 
 
 @cache
-def layout_of(layout_seed: int) -> GridLayout:
+def make_layout(layout_seed: int) -> GridLayout:
     """The layout of ``DoorKeyEnv(layout_seed=layout_seed)``."""
     env = DoorKeyGrid(layout_seed=layout_seed)
     env.reset()

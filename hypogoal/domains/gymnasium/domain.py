@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from hypogoal.core.config import Config, Values, setting
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Domain
+from hypogoal.domains.base import Domain, Layouts
 from hypogoal.domains.gymnasium.engine import MEMORY, GymnasiumEngine, Label, Success
 from hypogoal.domains.gymnasium.play import SEEDS, Policy, collect
 from hypogoal.domains.gymnasium.reader import Reader, reader_of
@@ -138,5 +138,5 @@ class GymnasiumDomain(Domain[GymnasiumConfig]):
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
         """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory`` and the domain's own settings."""
-        layouts = arguments.pop("layouts", layout_seed)
+        layouts = arguments.pop("layouts", Layouts((layout_seed,)))
         return GymnasiumEngine(self, layouts, count, max_steps=max_steps, **{"memory": self.memory} | arguments)

@@ -23,7 +23,7 @@ Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
 MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
 
 
-def labels_of(env: gymnasium.Env, functions: Mapping[str, Label]) -> Bools:
+def ask_labels(env: gymnasium.Env, functions: Mapping[str, Label]) -> Bools:
     """Which sub-goals hold in an environment's state, bool (G,), by a function each; ``UserError`` if one is unsure."""
     labels = []
     for name, function in functions.items():
@@ -56,7 +56,7 @@ class GymnasiumEngine(TurnEngine):
     def __init__(
         self,
         domain: GymnasiumDomain,
-        layouts: int | Layouts,
+        layouts: Layouts,
         count: int,
         *,
         max_steps: int,
@@ -65,7 +65,7 @@ class GymnasiumEngine(TurnEngine):
     ):
         super().__init__()
         self.domain, self.count, self.max_steps = domain, count, max_steps
-        self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
+        self.layouts: Layouts = layouts
         self.memory: int = memory
         self.room = 2 * memory
         self.width = len(domain.sub_goals) + DIGEST  # the facts are labels, and what identifies the state
@@ -115,7 +115,7 @@ class GymnasiumEngine(TurnEngine):
         """The id of an environment's current state, in the layout of a seed."""
         domain = self.domain
         image = domain.reader.read(observation)
-        labels = labels_of(env, domain.label_functions)
+        labels = ask_labels(env, domain.label_functions)
         besides = labels.tobytes()
         if domain.plan:
             hidden = domain.plan(env) if callable(domain.plan) else None
@@ -123,7 +123,7 @@ class GymnasiumEngine(TurnEngine):
         look = digest(image, besides)
         state = self._ids.get(look)
         if state is None or state < self.n_states - self.memory:
-            state = self._add(image, np.append(labels, np.frombuffer(look, np.uint8)).astype(np.uint8))
+            state = self._add(image, labels.tobytes() + look)
             self._file(look, state)
         return state
 
@@ -147,7 +147,7 @@ class GymnasiumEngine(TurnEngine):
 
     def labels(self, ids: Ints) -> Bools:
         labels = len(self.domain.sub_goals)
-        return self.facts_of(ids)[:, :labels].view(bool)
+        return self.read_facts(ids)[:, :labels].view(bool)
 
     def snapshot(self) -> State:
         """All that a resumed run needs: the states, and the actions played since each episode began."""
@@ -159,11 +159,10 @@ class GymnasiumEngine(TurnEngine):
         A ``UserError`` if they lead to other states: the environment is not deterministic.
         """
         super().restore(snapshot)
-        states = np.arange(self.oldest, self.n_states)
-        looks = self.facts_of(states)[:, -DIGEST:]
-        self._seen = dict(zip(states.tolist(), snapshot["images"], strict=True))
+        looks = self.read_facts(self.kept)[:, -DIGEST:]
+        self._seen = dict(zip(self.kept, snapshot["images"], strict=True))
         self._ids.clear()
-        for state, look in zip(states.tolist(), looks, strict=True):
+        for state, look in zip(self.kept, looks, strict=True):
             self._file(look.tobytes(), state)
         for number in range(self.count):
             self._replay(number)

@@ -14,7 +14,7 @@ from hypogoal.core.arrays import Bools
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GET_MORE, PLANTED, Collected, States, Unmet, require_classes
-from hypogoal.domains.gymnasium.engine import labels_of
+from hypogoal.domains.gymnasium.engine import ask_labels
 from hypogoal.observations import Observations, digest
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Met(NamedTuple):
     origin: tuple[int, ...]  # by ``ORIGINS``, then the domain's own
 
 
-def played(
+def play_layout(
     policies: Sequence[Policy | None],
     env: Any,
     layout_seed: int,
@@ -68,7 +68,7 @@ def played(
             over = terminated or truncated or elapsed >= config.max_episode_steps
 
 
-def sampled(
+def sample_layout(
     domain: GymnasiumDomain,
     env: Any,
     layout_seed: int,
@@ -86,7 +86,7 @@ def sampled(
     kept: dict[bytes, list[Met]] = {}  # by labels
     offered: Counter[bytes] = Counter()
     begun = b""
-    for observation, origin in played(domain.policies, env, layout_seed, config, rng):
+    for observation, origin in play_layout(domain.policies, env, layout_seed, config, rng):
         try:
             values = domain.reader.read(observation)
         except UserError as error:
@@ -101,8 +101,8 @@ def sampled(
         if look in seen:
             continue
         seen.add(look)
-        labels = labels_of(env, domain.label_functions)
-        changed = labels != labels_of(env, domain.label_functions)
+        labels = ask_labels(env, domain.label_functions)
+        changed = labels != ask_labels(env, domain.label_functions)
         if changed.any():
             names = ", ".join(np.array(domain.sub_goals)[changed])
             raise UserError("a label differs when it is asked for again", names, "Have it keep nothing.")
@@ -120,10 +120,10 @@ def sampled(
         place = int(rng.integers(offered[combination]))
         if place < config.states:
             sample[place] = state
-    return even_sample(list(kept.values()), config.states, rng)
+    return sample_evenly(list(kept.values()), config.states, rng)
 
 
-def even_sample(samples: list[list[Met]], size: int, rng: Generator) -> list[Met]:
+def sample_evenly(samples: list[list[Met]], size: int, rng: Generator) -> list[Met]:
     """Up to ``size`` states of all samples, as evenly as possible, in the order in which they were reached."""
     states: list[Met] = []
     samples.sort(key=len)
@@ -156,7 +156,7 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
             seen = set(training) if name == "heldout_seeds" else set()
             rng = rng_for(seed, "play", layout_seed)
             by_features = name != "unlabelled_seeds"  # nobody knows them there
-            met += sampled(domain, env, layout_seed, config, seen, rng, by_features=by_features)
+            met += sample_layout(domain, env, layout_seed, config, seen, rng, by_features=by_features)
             progress.advance()
         env.close()
         if not met:

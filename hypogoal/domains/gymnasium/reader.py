@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import batch_space, iterate
 
 from hypogoal.core.errors import UserError
 from hypogoal.domains.observations import CLEARLY, reading_of
@@ -95,9 +96,8 @@ def reader_of(space: Space, key: str = "") -> Reader:
     """A reader of an observation space, or of what a ``Dict`` has under ``key``.
 
     A ``Dict`` of pictures and others, each under a key of its own, is read by key, without its text, which a warning
-    names. Other spaces that
-    Gymnasium's ``flatten`` accepts become float32 (D,) in its order. Observations that are neither pictures nor numbers
-    are a ``UserError``.
+    names. Other spaces that Gymnasium's ``flatten`` accepts become float32 (D,) in its order. Observations that are
+    neither pictures nor numbers are a ``UserError``.
     """
     space, texts = _split(space)
     if texts:
@@ -207,7 +207,8 @@ def recorded(space: Space, values: Any, keys: Collection[str] = (), place: str =
     arrays = {}
     if is_wanted and not has_pictures and not isinstance(space, spaces.Box | spaces.Text):
         numbers, texts = _split(space)
-        arrays[place] = _flattened(numbers, values)
+        steps = iterate(batch_space(numbers), values)
+        arrays[place] = np.array([spaces.flatten(numbers, step) for step in steps])
         parts = [(key, part) for key, part in _entries(space) if key in texts]
     elif isinstance(space, spaces.Dict | spaces.Tuple):
         parts = _entries(space)
@@ -217,14 +218,6 @@ def recorded(space: Space, values: Any, keys: Collection[str] = (), place: str =
         inner = f"{place}/{key}".removeprefix("/")
         arrays |= recorded(part, values[key], () if is_wanted else keys, inner)
     return arrays
-
-
-def _flattened(space: Space, values: Any) -> Any:
-    """Observations (T, ...) as Gymnasium flattens each, (T, D)."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        rows = [_flattened(part, values[key]) for key, part in _entries(space)]
-        return np.concatenate(rows, axis=1)
-    return np.array([spaces.flatten(space, value) for value in values])
 
 
 def _entries(space: Any) -> list[tuple[Any, Any]]:

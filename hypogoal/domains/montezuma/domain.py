@@ -78,7 +78,7 @@ class MontezumaConfig(Config):
     workers: int = setting(0, "rooms played at once, each in a process; 0 for one per core", low=0, high=1024)
 
 
-def rooms_of(config: MontezumaConfig) -> tuple[list[int], list[int]]:
+def choose_rooms(config: MontezumaConfig) -> tuple[list[int], list[int]]:
     """The rooms of the labelled states and of the unlabelled ones.
 
     Labelled are the first N groups of each sub-goal. The others are two: one without labels where the first sub-goal
@@ -103,11 +103,11 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
     set. The result does not depend on the number of processes.
 
     ``seed`` seeds the rollouts; each room of each set has its own stream. All three sets have labels (the unlabelled
-    states' are for tests only). Origins: see ``states.states_of``; held-out states also have ``seen``: 0 the room is in
-    no training set, 1 it is an unlabelled room, 2 a labelled one. No emulator, or a room with too few different states
-    is a ``UserError``.
+    states' are for tests only). Origins: see ``states.describe_states``; held-out states also have ``seen``: 0 the room
+    is in no training set, 1 it is an unlabelled room, 2 a labelled one. No emulator, or a room with too few different
+    states is a ``UserError``.
     """
-    labelled, unlabelled = rooms_of(config)
+    labelled, unlabelled = choose_rooms(config)
     names = tuple(dict.fromkeys(config.sub_goals))
     sub_goals = [SUB_GOALS[name] for name in names]
     sets = {
@@ -131,9 +131,8 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
     in_processes(jobs, allowed(config.workers), done)
     for_labels, without_labels, heldout = [joined(gathered[place]) for place in places]
     room_numbers = heldout.origins["room"]
-    seen = np.full(len(room_numbers), SEEN_NOWHERE)
-    seen[np.isin(room_numbers, unlabelled)] = SEEN_UNLABELLED
-    seen[np.isin(room_numbers, labelled)] = SEEN_LABELLED
+    is_in = [np.isin(room_numbers, rooms) for rooms in (labelled, unlabelled)]
+    seen = np.select(is_in, [SEEN_LABELLED, SEEN_UNLABELLED], SEEN_NOWHERE)
     heldout = replace(heldout, origins={**heldout.origins, "seen": seen})
     return Collected(game.OBSERVATION_SHAPE, names, for_labels, without_labels, heldout)
 

@@ -76,7 +76,7 @@ class Snapshot(NamedTuple):
     seen: Frames
 
 
-def stacked(seen: Sequence[Bytes]) -> Bytes:
+def stack_frames(seen: Sequence[Bytes]) -> Bytes:
     """Four frames (84, 84), the oldest first, as uint8 (84, 84, 4): ``np.stack(seen, axis=-1)``, ten times faster."""
     import cv2
 
@@ -84,7 +84,7 @@ def stacked(seen: Sequence[Bytes]) -> Bytes:
     return merged
 
 
-def row_of(rooms: Any) -> Any:
+def find_row(rooms: Any) -> Any:
     """The pyramid's row (0 the top one) of a room 0..23, or of an array of them."""
     return np.searchsorted(FIRST_ROOM_OF_ROW, rooms, side="right") - 1
 
@@ -126,7 +126,7 @@ class Emulator:
     @property
     def stack(self) -> Bytes:
         """The observation, uint8 (84, 84, 4), a new array."""
-        return stacked(self.seen)
+        return stack_frames(self.seen)
 
     def step(self, action: int) -> float:
         """Play four frames of ``action`` (0..17); returns the sum of their rewards."""
@@ -209,7 +209,7 @@ class Emulator:
         else:
             neighbour, x, action = room - 1, RIGHT_EDGE, RIGHT
         self.ale.restoreState(self._first_room)
-        self.write("row", int(row_of(room)))
+        self.write("row", int(find_row(room)))
         self.write("inventory", self.read("inventory") | TORCH)
         self.write("room", neighbour)
         self.write("x", x)

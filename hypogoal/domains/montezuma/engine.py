@@ -15,7 +15,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import TurnEngine
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.env import MAX_STEPS, START_STATES, make_starts
-from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, labels_of
+from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, judge_sub_goals
 
 MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
 
@@ -35,7 +35,7 @@ class MontezumaEngine(TurnEngine):
     observation_shape = game.OBSERVATION_SHAPE
     position_names = game.Position._fields
     width = len(game.FACTS)
-    _image = staticmethod(game.stacked)
+    _image = staticmethod(game.stack_frames)
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class MontezumaEngine(TurnEngine):
         self._rng = rng_for(seed, "start-of-episode")
         for begin in self.starts:
             emulator.restore(begin)
-            self._add(begin.seen, emulator.facts())
+            self._add(begin.seen, emulator.facts().tobytes())
         self.reset()
 
     def _begin(self, number: int) -> int:
@@ -68,34 +68,34 @@ class MontezumaEngine(TurnEngine):
         emulator = self._emulators[number]
         reward = emulator.step(action)
         facts = emulator.facts()
-        state = self._add(emulator.seen, facts)
+        state = self._add(emulator.seen, facts.tobytes())
         terminated = bool(facts[game.DYING])
         truncated = elapsed >= self.max_steps
         return state, reward, terminated, truncated
 
     def positions(self, ids: Ints) -> Ints:
-        facts = self.facts_of(ids)
+        facts = self.read_facts(ids)
         return facts[:, : len(self.position_names)].astype(int)
 
     def labels(self, ids: Ints) -> Bools:
-        facts = self.facts_of(ids)
-        return labels_of(facts, SUB_GOALS.values())
+        facts = self.read_facts(ids)
+        return judge_sub_goals(facts, SUB_GOALS.values())
 
     def snapshot(self) -> dict[str, Any]:
         """All that a resumed run needs, nearly all of it the frames in memory."""
         stacks = [*self._seen.values()]
         stacks += [emulator.seen for emulator in self._emulators]
-        frames = [*chain(*stacks)]
-        addresses = [*map(id, frames)]
-        _, first, rows = np.unique(addresses, return_index=True, return_inverse=True)
+        frames = {id(frame): frame for frame in chain(*stacks)}  # each once
+        place = {address: row for row, address in enumerate(frames)}
+        rows = [place[id(frame)] for frame in chain(*stacks)]
         states = []
         for emulator in self._emulators:
             state = emulator.ale.cloneState().serialize()
             states.append(np.frombuffer(state, np.uint8))
         return {
             **super().snapshot(),
-            "frames": np.stack([frames[place] for place in first]),  # each once
-            "stacks": rows.reshape(-1, game.STACK),
+            "frames": np.stack([*frames.values()]),
+            "stacks": np.reshape(rows, (-1, game.STACK)),
             "states": states,
         }
 
@@ -105,15 +105,9 @@ class MontezumaEngine(TurnEngine):
 
         super().restore(snapshot)
         frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
-        rows = snapshot["stacks"].tolist()
-        stacks = [itemgetter(*numbers)(frames) for numbers in rows]
-        kept = stacks[: -self.count]
+        stacks = [itemgetter(*rows)(frames) for rows in snapshot["stacks"].tolist()]
+        self._seen = dict(zip(self.kept, stacks[: -self.count], strict=True))
         playing = stacks[-self.count :]
-        starts = range(len(self.starts))
-        latest = range(self.oldest, self.n_states)
-        self._seen = dict(zip([*starts, *latest], kept, strict=True))
-        states = snapshot["states"]
-        for emulator, saved, seen in zip(self._emulators, states, playing, strict=True):
+        for emulator, saved, seen in zip(self._emulators, snapshot["states"], playing, strict=True):
             state = ALEState(saved.tobytes())
-            start = game.Snapshot(state, seen)
-            emulator.restore(start)
+            emulator.restore(game.Snapshot(state, seen))

@@ -15,7 +15,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.emulator import Position
 from hypogoal.domains.montezuma.ladders import LADDERS, MEASURED
-from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, around, inside, labels_of
+from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, around, inside, judge_sub_goals
 
 MAX_STEPS = 200  # agent steps an episode; an option's own time in Table 2
 START_STATES = 32
@@ -61,7 +61,7 @@ def make_starts(emulator: game.Emulator, name: str, count: int, seed: int) -> li
         start = _start(emulator, name, phase)
         if start is None:
             continue
-        look = game.stacked(start.seen).tobytes()
+        look = game.stack_frames(start.seen).tobytes()
         if look in by_look:
             alike.append(start)
         else:
@@ -145,7 +145,7 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
 
     def _info(self) -> dict[str, Any]:
         facts = self.emulator.facts()
-        [labels] = labels_of(facts[None], SUB_GOALS.values())
+        [labels] = judge_sub_goals(facts[None], SUB_GOALS.values())
         named = zip(SUB_GOALS, labels.tolist(), strict=True)
         return {
             "labels": dict(named),

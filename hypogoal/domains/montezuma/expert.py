@@ -72,7 +72,7 @@ class Expert:
         self.emulator = emulator
         self.room = room
         self.rng = rng
-        self.places = standing_places(emulator, room)
+        self.places = find_standing_places(emulator, room)
         self.spots = []
         sides = []
         for goal in sub_goals:
@@ -81,7 +81,7 @@ class Expert:
         starts: dict[str, Sequence[Any]] = {
             "spot": self.spots,
             "side": sides,
-            "ladder": climbs_in(room),
+            "ladder": find_climbs(room),
         }
         self.in_turn = {}  # each kind's starts, in a random order, again and again
         for kind, rows in starts.items():
@@ -191,7 +191,7 @@ def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
     return game.NOOP, 1
 
 
-def climbs_in(room: int) -> list[tuple[int, int, int, int]]:
+def find_climbs(room: int) -> list[tuple[int, int, int, int]]:
     """Each climb that begins in a room: its x, y and action, and the most agent steps without leaving the room."""
     climbs = []
     for ladder in LADDERS:
@@ -205,7 +205,7 @@ def climbs_in(room: int) -> list[tuple[int, int, int, int]]:
     return climbs
 
 
-def standing_places(emulator: Emulator, room: int) -> Ints:
+def find_standing_places(emulator: Emulator, room: int) -> Ints:
     """Places x, y (n, 2) of a room where an agent placed there stands on something, in the open.
 
     Many places lie inside walls, so the agent's box must be black, with something under its feet. Room 15 has no black

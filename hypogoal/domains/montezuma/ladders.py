@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hypogoal.core.arrays import Ints
-from hypogoal.domains.montezuma.emulator import FIRST_ROOM_OF_ROW, Position, row_of
+from hypogoal.domains.montezuma.emulator import FIRST_ROOM_OF_ROW, Position, find_row
 
 _FILE = Path(__file__).with_name("measured.toml")
 MEASURED = tomllib.loads(_FILE.read_text(encoding="utf-8"))
@@ -59,14 +59,14 @@ FAR = 10**9  # longer than any path
 def plane(positions: Ints) -> Ints:
     """Positions (n, 3) as coordinates (n, 2) in one plane, x to the right, y upwards."""
     room, x, y = positions.T
-    row = row_of(room)
+    row = find_row(room)
     column = room - np.take(FIRST_ROOM_OF_ROW, row) - row
     across = x + ROOM_WIDTH * column
     upwards = y - ROOM_HEIGHT * row
     return np.stack([across, upwards], axis=1)
 
 
-def region_of(rooms: Ints) -> Ints:
+def find_region(rooms: Ints) -> Ints:
     """The numbers of rooms' regions."""
     return np.searchsorted(FIRST_ROOM_OF_REGION, rooms, side="right")
 
@@ -75,8 +75,8 @@ def straight(positions: Ints, others: Ints) -> Ints:
     """The Manhattan distance of positions (n, 3) from others (m, 3), ``FAR`` between regions; int64 (n, m)."""
     apart = plane(positions)[:, None] - plane(others)
     away = np.abs(apart).sum(2)
-    region = region_of(positions[:, 0])
-    other_region = region_of(others[:, 0])
+    region = find_region(positions[:, 0])
+    other_region = find_region(others[:, 0])
     is_joined = region[:, None] == other_region
     return np.where(is_joined, away, FAR)
 

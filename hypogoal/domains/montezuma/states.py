@@ -20,7 +20,7 @@ from hypogoal.domains.montezuma.sub_goals import (
     SubGoal,
     around,
     inside,
-    labels_of,
+    judge_sub_goals,
 )
 from hypogoal.observations import digest
 
@@ -48,7 +48,7 @@ At = tuple[str, int]  # a sub-goal's name and the index of its place
 HELD_OUT_EACH = 3  # every third stack, by its digest, may be held out; all others, and only they, are for training
 
 
-def kinds_of(facts: Ints) -> Ints:
+def tell_kinds(facts: Ints) -> Ints:
     """Each state's kind, an index into ``KINDS``, int64 (n,), from facts (n, ``FACTS``): the first that fits."""
     fits = {
         DEAD: facts[:, DYING] > 0,
@@ -61,7 +61,7 @@ def kinds_of(facts: Ints) -> Ints:
     return np.select([*fits.values()], [*fits], default=ELSEWHERE)
 
 
-def states_of(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
+def describe_states(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
     """Observations, labels of the sub-goals (n, G), and origins, int64 (n,) each.
 
     Origins: room, x, y; group 1..7 of the room (0: it has no ladder); kind, an index into ``KINDS``; ladder, the index
@@ -79,13 +79,13 @@ def states_of(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
         "x": x,
         "y": y,
         "group": group,
-        "kind": kinds_of(facts),
+        "kind": tell_kinds(facts),
         "ladder": sub_goals[0].at(facts),
         "dying": np.sign(facts[:, DYING]),
         "action": np.array(actions),
         "previous_action": np.array(previous),
     }
-    labels = labels_of(facts, sub_goals)
+    labels = judge_sub_goals(facts, sub_goals)
     return States(np.stack(stacks), labels, origins)
 
 
@@ -140,7 +140,7 @@ def gather(split: str, room: int, wanted: int, seed: int, sub_goals: Sequence[Su
         raise UserError(
             f"room {room} does not show {wanted} different states", f"{len(pool)} in {step} steps", "Ask for fewer."
         )
-    states = states_of(pool, sub_goals)
+    states = describe_states(pool, sub_goals)
     kinds = np.where(states.labels.any(1), POSITIVE, states.origins["kind"])
     positions = np.stack([states.origins[name] for name in ("room", "x", "y")], axis=1)
     return states.where(choose(kinds, positions, wanted, rng))

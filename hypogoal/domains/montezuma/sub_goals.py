@@ -64,8 +64,10 @@ class SubGoal:
     Attributes:
         places: one in each region; distances are to the nearest.
         regions: int64 (m, ``Region``).
-        spots: where the expert begins and heads for.
-        sides: where it begins, too.
+        spots: where the expert is placed and heads for. Something must be under its feet, or a ladder, since an agent
+            that is placed in the air falls: where the sub-goal holds in the air only, give the ground from which agents
+            get there.
+        sides: where it is placed, too.
         unclear: indices of places whose states are labelled nowhere.
     """
 
@@ -82,7 +84,7 @@ class SubGoal:
         return np.where(is_inside.any(1), is_inside.argmax(1), -1)
 
 
-def labels_of(facts: NDArray[np.integer], sub_goals: Iterable[SubGoal]) -> Bools:
+def judge_sub_goals(facts: NDArray[np.integer], sub_goals: Iterable[SubGoal]) -> Bools:
     """Whether each sub-goal holds, bool (n, G), by facts (n, ``FACTS``)."""
     reached = [sub_goal.at(facts) >= 0 for sub_goal in sub_goals]
     lives = facts[:, [DYING]] == 0

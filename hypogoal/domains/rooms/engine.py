@@ -11,7 +11,7 @@ from hypogoal.core.config import Config, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, Plan, Step
-from hypogoal.domains.rooms.states import FACTORS, drawn
+from hypogoal.domains.rooms.states import FACTORS, draw_scenes
 
 DECKS = 64  # sets of rooms of a layout; episodes cycle through them
 
@@ -71,7 +71,7 @@ class RoomsEngine(Engine):
         holds[..., config.factors.index(config.truth)] = right
         before = np.zeros((DECKS, factors), bool)
         every = np.concatenate([before, holds.reshape(-1, factors)])
-        self._pictures = drawn(every, config.factors, rng).observations
+        self._pictures = draw_scenes(every, config.factors, rng).observations
         self._right = np.zeros(self.n_states, bool)
         self._right[DECKS:] = right.ravel()
         self.observation_shape = self._pictures.shape[1:]

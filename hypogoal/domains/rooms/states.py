@@ -11,7 +11,7 @@ from numpy.random import Generator
 
 from hypogoal.core.arrays import Bools, Bytes, Ints
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.tiles import TILE, drawn_tiles
+from hypogoal.domains.tiles import TILE, draw_tiles
 
 FACTORS = ("colour", "shape", "place", "count")
 MEANINGS = {
@@ -47,7 +47,7 @@ def labelled_states(count: int, seed: int, names: Sequence[str]) -> Scenes:
     every_other = np.arange(count) % 2 == 0
     positive = rng.permutation(every_other)
     factors = np.repeat(positive[:, None], len(names), axis=1)
-    return drawn(factors, names, rng)
+    return draw_scenes(factors, names, rng)
 
 
 def unlabelled_states(
@@ -65,7 +65,7 @@ def unlabelled_states(
     joint = rng.random((count, 1)) < 0.5
     mixed = rng.random((count, 1)) < mix
     factors = np.where(mixed, independent, joint)
-    return drawn(factors, names, rng)
+    return draw_scenes(factors, names, rng)
 
 
 def crossed_states(copies: int, seed: int, names: Sequence[str]) -> Scenes:
@@ -73,10 +73,10 @@ def crossed_states(copies: int, seed: int, names: Sequence[str]) -> Scenes:
     rng = rng_for(seed, "which-feature", "test")
     combinations = list(product((False, True), repeat=len(names)))
     factors = np.repeat(combinations, copies, axis=0)
-    return drawn(rng.permutation(factors), names, rng)
+    return draw_scenes(rng.permutation(factors), names, rng)
 
 
-def drawn(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
+def draw_scenes(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
     """Scenes with these factors, bool (N, F); everything else is random and independent of them."""
     count = len(factors)
     truth = dict(zip(names, factors.T, strict=True))
@@ -117,10 +117,10 @@ def drawn(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
     contents[:, end] = np.where(has_goal, GOAL, FLOOR)
     ids = np.empty_like(contents)
     np.put_along_axis(ids, cells, contents, axis=1)
-    return Scenes(image_of(ids), factors)
+    return Scenes(draw_pictures(ids), factors)
 
 
-def image_of(ids: Ints) -> Bytes:
+def draw_pictures(ids: Ints) -> Bytes:
     """Kinds of tiles (N, 16), row by row -> uint8 (N, 48, 48, 3) with walls around."""
     count = len(ids)
     grid = np.full((count, INNER + 2, INNER + 2), WALL)
@@ -142,4 +142,4 @@ def tiles() -> Bytes:
         Goal(),
     ]
     agents = product([None], range(4))
-    return drawn_tiles([(None, None), (Wall(), None), *agents, *product(objects, [None])])
+    return draw_tiles([(None, None), (Wall(), None), *agents, *product(objects, [None])])
