@@ -30,6 +30,7 @@ from hypogoal.evaluation import (
     hypotheses,
     judging,
     page,
+    parting,
     provenance,
     rooms,
     saliency,
@@ -63,6 +64,7 @@ class Question:
 
 
 QUESTIONS = (  # in the order of the page
+    Question(parting),
     Question(curves, rows=curves.rows, beside=True),
     Question(rooms, beside=True),
     Question(distance, rows=distance.rows, beside=True),

@@ -45,7 +45,7 @@ def table_of(run, name):
 def test_the_page_opens_with_a_verdict_of_its_numbers(ladders):
     """Spec I1: options of several members against those of one classifier, recomputed from ``numbers.csv``."""
     task = "The reward and the end of an episode are those of the domain 'ladder_run:DOMAIN'"
-    alike = "Several hypotheses made no difference on these 2 ladders: options"
+    alike = "Having several hypotheses made no difference on these 2 ladders: options"
     agrees(ladders, task, alike, "Fewer than six layouts or seeds are not evidence")
 
 
@@ -172,7 +172,7 @@ def test_the_page_shows_ladders_and_nothing_of_agents(ladders, page):
     assert page.count("<figure") == 5
     assert "–: no unseen room has positives left" in page
     assert "mean over ladders (1L and 2-6) and over seeds (0 and 1)" in page
-    assert "Missing in this run" not in page
+    assert "This run lacks" not in page
     names = {path.stem for path in (ladders / "report" / "figures").iterdir()}
     assert names == {"figure2", "figure3", "figure4", "figure5-1L", "figure5-2-6", "figure9"}
 
