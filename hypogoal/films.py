@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.errors import UserError
 from hypogoal.evaluation.pictures import coloured
-from hypogoal.evaluation.plots import GREY, INK, PALETTE
+from hypogoal.evaluation.plots import INK, PALETTE
 from hypogoal.evaluation.run import choice_of, find_artefacts
 from hypogoal.observations import PICTURE
 
@@ -26,6 +26,7 @@ SIDE = 336  # pixels that a moving state is enlarged to, or a little less
 LINE, MARGIN, BAR, FONT = 18, 8, 8, 13  # pixels below it
 STEP, PAUSE, END, LAST = 140, 500, 600, 1_500  # milliseconds: a step, members differ, an option's end, the last frame
 SHADES = 48  # colours of a film
+FAINT = "#a2a9b2"  # on the ink of a film it can be read
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[st
     for member, positive in enumerate(frame.predictions):
         name = f"member {member}" if members > 1 else "its classifier"
         mark = ">" if member == running else " "
-        says = "positive" if positive else "negative"
+        says = "reached" if positive else "not reached"
         lines.append(f"{mark} {name}: {says}")
     end = f", ends: {frame.ended}" if frame.ended else ""
     return [*lines, f"step {frame.step}{end}"]
@@ -108,7 +109,7 @@ def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[st
 def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> Image.Image:
     """A frame enlarged; a bar is as long as the steps that are left to the option, of ``timeout``.
 
-    Option g*K + k is member k of sub-goal g, whose colour the bar has; positive predictions are written in white.
+    Option g*K + k is member k of sub-goal g, whose colour the bar has; who says 'reached' is written in white.
     """
     state = Image.fromarray(coloured(frame.observation))
     state = ImageOps.scale(state, max(1, SIDE // max(state.size)), Image.Resampling.NEAREST)
@@ -122,7 +123,7 @@ def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: in
     font = ImageFont.load_default(FONT)
     top = height + BAR + MARGIN
     for line in lines:
-        draw.text((MARGIN, top), line, GREY if line.endswith("negative") else "white", font)
+        draw.text((MARGIN, top), line, FAINT if line.endswith("not reached") else "white", font)
         top += LINE
     return picture
 

@@ -109,8 +109,7 @@ def _within_rho(quality, preference, goals):
     for _, alike in both.groupby(goals[both.index]):
         differ = statistics.at_least(np.ptp(alike["quality"]), DIFFERENCE)
         if differ and alike["preference"].nunique() > 1:
-            ranks = alike.rank()  # whose correlation is Spearman's
-            rhos.append(ranks["quality"].corr(ranks["preference"]))
+            rhos.append(alike.corr("spearman").loc["quality", "preference"])
     return pd.Series(rhos, dtype=float).mean()
 
 

@@ -154,26 +154,13 @@ def context(results):
 
 
 def chosen_in(results) -> dict[str, Any]:
-    """For the template: the weights that ``diversity_weight=auto`` tried, a row each, and members that are idle."""
-    rows, idle = [], []
+    """For the template: by ensemble and sub-goal, what ``diversity_weight=auto`` chose, and tried."""
     recorded = results.facts.get("provenance", {"artefacts": []})  # not where several runs are compared
+    chosen = {}
     for artefact in recorded["artefacts"]:
-        for sub_goal, chosen in artefact["config"].get("chosen", {}).items():
-            place = f"{artefact['path']}, {sub_goal}"
-            idle += [f"{place}: {text}" for text in chosen["idle"]]
-            for tried in chosen["tried"]:
-                remark = ""
-                if tried["kept"]:
-                    remark = "chosen"
-                elif tried["constant"]:
-                    remark = "a member is constant"
-                elif tried.get("contrary"):  # not in manifests made before the limit
-                    remark = "on more than half"
-                disagreement = tried["disagreement"]
-                shown = "–" if disagreement is None else f"{disagreement:.2f}"
-                numbers = f"{tried['weight']:g}", f"{tried['accuracy']:.3f}", f"{chosen['lowest']:.3f}", shown
-                rows.append((place, *numbers, remark))
-    return {"tried": rows, "idle": idle}
+        for sub_goal, of_goal in artefact["config"].get("chosen", {}).items():
+            chosen[f"{artefact['path']}, {sub_goal}"] = of_goal
+    return {"chosen": chosen}
 
 
 def members_figure(means: pd.DataFrame) -> Figure:

@@ -248,9 +248,11 @@ def lines_of(template: str, /, **context: Any) -> list[str]:
 
 
 def write(folder: Path, text: str, figures: Iterable[Drawn]) -> None:
-    """Write a page, ``index.html``, and its figures as files beside it."""
+    """Write a page, ``index.html``, and those of the figures that are drawn in it as files beside it."""
     (folder / "index.html").write_text(text, encoding="utf-8")
     (folder / "figures").mkdir()
     for drawn in figures:
+        if "svg" not in vars(drawn):  # nobody has looked at it
+            continue
         path = folder / "figures" / f"{slug(drawn.name)}.svg"
         path.write_bytes(drawn.svg)

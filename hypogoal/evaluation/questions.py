@@ -30,8 +30,10 @@ from hypogoal.evaluation import (
     hypotheses,
     judging,
     page,
+    parting,
     provenance,
     rooms,
+    run,
     saliency,
     selection,
     statistics,
@@ -40,7 +42,6 @@ from hypogoal.evaluation import (
     verdict,
     zero_shot,
 )
-from hypogoal.evaluation.run import FORMAT, Results
 
 Context = dict[str, Any]  # what a question's template is given
 Rows = Iterable[pd.DataFrame]  # of the table of numbers
@@ -63,6 +64,7 @@ class Question:
 
 
 QUESTIONS = (  # in the order of the page
+    Question(parting),
     Question(curves, rows=curves.rows, beside=True),
     Question(rooms, beside=True),
     Question(distance, rows=distance.rows, beside=True),
@@ -76,13 +78,13 @@ QUESTIONS = (  # in the order of the page
 )
 
 
-def answers(results: Results) -> list[Context]:
+def answers(results: run.Results) -> list[Context]:
     """Of every question that the run has something of, in the order of the page."""
     contexts = [context_of(question, results) for question in QUESTIONS]
     return [context for context in contexts if context]
 
 
-def context_of(question: Question, results: Results) -> Context | None:
+def context_of(question: Question, results: run.Results) -> Context | None:
     """What a question's template is given; None where the run has nothing of it."""
     parts = question.module.context(results)
     if not parts:
@@ -100,7 +102,7 @@ def context_of(question: Question, results: Results) -> Context | None:
     }
 
 
-def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
+def answer(work: judging.Work, settings: Mapping[str, Any]) -> run.Results:
     """Every number of a run, and what else its page needs: ensembles are judged, then all questions asked."""
     parts: list[pd.DataFrame] = []
     for judgement in work.judgements():
@@ -114,7 +116,7 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
     numbers = table.joined(parts)
     missing = [] if work.contents.ensembles else ["no ensemble"]
     facts = {
-        "format": FORMAT,
+        "format": run.FORMAT,
         "run": work.contents.run.resolve().name,
         "settings": settings,
         "provenance": provenance.provenance(work.contents),
@@ -124,10 +126,10 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> Results:
         **undecided.facts(work, numbers),
         **work.facts,
     }
-    return Results(numbers, facts)
+    return run.Results(numbers, facts)
 
 
-def write(folder: Path, results: Results, every: list[Context]) -> list[str]:
+def write(folder: Path, results: run.Results, every: list[Context]) -> list[str]:
     """Write ``numbers.csv``, ``run.json`` and, of :func:`answers`, ``tables/*.csv`` and the summary; return that."""
     results.numbers.to_csv(folder / "numbers.csv", index=False)
     (folder / "run.json").write_text(as_json(results.facts) + "\n", encoding="utf-8")
@@ -144,7 +146,7 @@ def write(folder: Path, results: Results, every: list[Context]) -> list[str]:
     return lines
 
 
-def summary(results: Results, every: list[Context]) -> list[str]:
+def summary(results: run.Results, every: list[Context]) -> list[str]:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
     domains = ", ".join(provenance.domains_of(results))
     tables = []
@@ -163,12 +165,12 @@ def summary(results: Results, every: list[Context]) -> list[str]:
     return page.plain(Group(*tables, lines))
 
 
-def sentences(results: Results) -> list[str]:
+def sentences(results: run.Results) -> list[str]:
     """The verdict, a sentence a line."""
     return page.lines_of("verdict.txt", **verdict.context(results))
 
 
-def render(results: Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
+def render(results: run.Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
     """The page of a run, self-contained, with the figures of :func:`answers`."""
     return page.render(
         "run.html",

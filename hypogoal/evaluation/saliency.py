@@ -1,4 +1,4 @@
-"""What members look at in held-out states: Figures 2 and 9, and a gallery."""
+"""What members look at in held-out states: Figures 2 and 9."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -11,11 +11,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from hypogoal.core.arrays import Bools, Bytes, Floats, Ints
-from hypogoal.core.seeding import rng_for
+from hypogoal.core.arrays import Bytes, Floats
 from hypogoal.data import open_dataset
 from hypogoal.evaluation import judging, pictures, plots
 from hypogoal.evaluation.page import Drawn
+from hypogoal.evaluation.parting import states_of, states_to_show
 from hypogoal.evaluation.table import melted
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
@@ -25,7 +25,6 @@ GALLERY = 40  # states of all sub-goals
 EXPLAINED = 20  # of these with attributions: DeepLift takes .05 s for a state and member
 INTEGRATED = 5  # where they are integrated gradients: of a large network seconds
 AVERAGED = 64  # states over which attributions to features are averaged
-PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
 
 
 def look(work: judging.Work, judgement: judging.Judgement) -> Iterator[pd.DataFrame]:
@@ -81,28 +80,6 @@ def look(work: judging.Work, judgement: judging.Judgement) -> Iterator[pd.DataFr
         yield melted(columns, **place, scope=f"state: {kind}")
 
 
-def states_to_show(
-    judged: judging.Judged,
-    sub_goal: str,
-    most: int,
-) -> tuple[list[str], Ints]:
-    """States of the gallery, those of the figures first, and what kinds these are; unseen ones if some are positive."""
-    labels, origins = judged.labels, judged.origins
-    allowed = origins.get("seen", np.zeros(len(labels))) == 0
-    if not labels[allowed].any():
-        allowed[:] = True
-    kinds = pick_to_explain(judged.probabilities, judged.predictions, labels, allowed)
-    places = {name: origins[name] for name in PLACES if name in origins}
-    browsed = pick_for_gallery(
-        judged.predictions,
-        labels,
-        places,
-        rng_for(0, "browse", sub_goal),
-    )
-    states = pd.unique(np.array([*kinds.values(), *browsed]))
-    return [*kinds], states[:most]
-
-
 def of_features(values: Floats, dtype: Any) -> Floats:
     """Attributions (n, K, D) to each number; of mixed observations those to a picture are added up."""
     if not dtype.names:
@@ -116,90 +93,24 @@ def of_features(values: Floats, dtype: Any) -> Floats:
     return np.concatenate(features, axis=-1)
 
 
-def pick_to_explain(
-    probabilities: Floats,
-    predictions: Bools,
-    labels: Bools,
-    allowed: Bools,
-) -> dict[str, int]:
-    """Figures 2 and 9: the few of N states, by kind, whose attributions are drawn, no state twice.
-
-    ``true positive``: where most of K members are right and surest on average; ``disagree``: where members differ and
-    their probabilities are furthest apart; ``false positive``: where most err, and are surest. Fewer where none are.
-    """
-    positive = predictions.sum(axis=1)
-    some = positive > 0
-    surest = positive + probabilities.mean(axis=1)
-    candidates = {
-        "true positive": (labels & some, surest),
-        "disagree": (some & ~predictions.all(axis=1), np.ptp(probabilities, axis=1)),
-        "false positive": (~labels & some, surest),
-    }
-    free = allowed.copy()
-    picked = {}
-    for kind, (of_kind, order) in candidates.items():
-        among = of_kind & free
-        if among.any():
-            picked[kind] = int(np.where(among, order, -np.inf).argmax())
-            free[picked[kind]] = False
-    return picked
-
-
-def outcomes(predictions: Bools, labels: Bools) -> Any:
-    """Of predictions (n, K) of labels (n,): whether all members are right, all wrong, or they disagree."""
-    errors = (predictions != labels[:, None]).sum(axis=1)
-    return np.select([errors == 0, errors == predictions.shape[1]], ["all right", "all wrong"], "disagree")
-
-
-def pick_for_gallery(
-    predictions: Bools,
-    labels: Bools,
-    places: Mapping[str, Ints],
-    rng: np.random.Generator,
-) -> Ints:
-    """States by how interesting they are, int64 (N,): kinds of outcome take turns, and within each the places.
-
-    Takes predictions (N, K), labels (N,), places (N,) each. States on which all members are right come last; ``rng``
-    draws among states alike.
-    """
-    kinds = pd.DataFrame({"outcome": outcomes(predictions, labels), "label": labels})
-    states = kinds.assign(**places).sample(frac=1, random_state=rng)
-    turn = states.groupby([*states]).cumcount()
-    states = states.assign(turn=turn).sort_values("turn", kind="stable")
-    turn = states.groupby([*kinds]).cumcount()
-    right = states["outcome"] == "all right"
-    return states.assign(turn=turn, right=right).sort_values(["right", "turn"], kind="stable").index.to_numpy()
-
-
 def context(results):
-    """For the template: whose members, how they were explained, and the states of the gallery; Figures 2 and 9."""
+    """For the template: whose members, and how they were explained; Figures 2 and 9."""
     looked_at = results.facts.get("looked_at")
     if looked_at is None:
         return {}
     of_goals = looked_at["sub_goals"]
     explained = {name: facts for name, facts in of_goals.items() if facts["kinds"] or "features" in facts}
-    states, figures = [], []
-    for name, facts in of_goals.items():
-        arrays = results.within(f"saliency/{name}")  # none where only numbers are told
+    figures = []
+    for name, facts in explained.items():
         suffix = f"-{name}" if len(explained) > 1 else ""
-        if "observations" in arrays:
-            of_goal = [*_gallery(arrays, name, facts)]
-            states += of_goal
-            if facts["kinds"]:
-                figures += _figures(of_goal[0], facts["kinds"][0], suffix)
-        elif arrays:
-            draw = partial(bars_of_features, arrays["attributions"], facts["features"])
+        first = next(states_of(results, name, facts), None)  # none where only numbers are told
+        attributions = results.arrays.get(f"saliency/{name}/attributions")
+        if first:
+            figures += _figures(first, facts["kinds"][0], suffix)
+        elif attributions is not None:
+            draw = partial(bars_of_features, attributions, facts["features"])
             figures.append(Drawn(f"features{suffix}", "What members go by", draw, {"sub_goal": name}))
-    return {"ensemble": looked_at["ensemble"], "explained": explained, "states": states, "figures": figures}
-
-
-def _gallery(arrays, sub_goal, facts):
-    """Each state with its arrays, those of attributions if it has any."""
-    shared = {"sub_goal": sub_goal, "colours": facts["colours"], "attributions": []}
-    outcome = outcomes(arrays["predictions"], arrays["labels"])
-    for index, place in enumerate(facts["places"]):
-        of_state = {name: values[index] for name, values in arrays.items() if index < len(values)}
-        yield shared | of_state | {"place": place, "outcome": outcome[index]}
+    return {"ensemble": looked_at["ensemble"], "explained": explained, "figures": figures}
 
 
 def _figures(state, kind, suffix):

@@ -106,10 +106,13 @@ def among_members(agent: str, results: Results) -> dict[str, float]:
 
 
 def how_soon(agent: str, results: Results) -> dict[str, float]:
-    """After how many episodes 95 % of the last ones were solved: the median of the runs that got there, their share."""
+    """After how many episodes 95 % of the last ones were solved: the median of the runs that got there, their share.
+
+    ``trained``: the median of how many a training had.
+    """
     own = results.of(method=agent)
-    soon, every = per_run(own, "episodes_to_95"), per_run(own, "success")
-    return {"episodes": soon["value"].median(), "got_there": len(soon) / max(1, len(every))}
+    soon, trained, every = (per_run(own, name)["value"] for name in ("episodes_to_95", "episodes", "success"))
+    return {"episodes": soon.median(), "got_there": len(soon) / max(1, len(every)), "trained": trained.median()}
 
 
 def _of(method, numbers):

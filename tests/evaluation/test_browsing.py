@@ -17,9 +17,10 @@ from torch import nn
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.evaluation import page
 from hypogoal.evaluation.judging import Judged, Judgement, Work
+from hypogoal.evaluation.parting import outcomes, pick_for_gallery, pick_to_explain
 from hypogoal.evaluation.pictures import attribution_image, coloured, encoded, last_frame, overlay
 from hypogoal.evaluation.run import Contents
-from hypogoal.evaluation.saliency import look, outcomes, pick_for_gallery, pick_to_explain
+from hypogoal.evaluation.saliency import look
 from hypogoal.evaluation.table import joined
 from hypogoal.hypotheses import ensemble as hypotheses
 

@@ -86,7 +86,7 @@ def test_agents_over_runs() -> None:
     table = asked(question, results)["table"].set_index("quantity")
     assert table["mean"]["success"] == 0.5
     agent = shown(question, results).loc["option agent"]
-    assert (agent["runs"], agent["at 95 %"]) == ("3", "2")
+    assert (agent["runs"], agent["runs at 95 %"]) == ("3", "2")
     assert asked(question, results_of()) is None
 
 
@@ -152,7 +152,7 @@ def test_intervals_on_the_page_are_in_the_units_of_its_titles() -> None:
         place = {"method": "option agent", "layout": layout, "seed": 0, "artefact": f"a-{layout}"}
         rows += [row("success", 1, **place), row("solved_length", 12, **place), row("near", 0.5, **place)]
     context = asked(question, results_of(*rows, agents={"option agent": LEARNED}))
-    text = page.render("curves.html", **context).partition("Intervals and pairs")[2]
+    text = page.render("curves.html", **context).partition("95 % intervals, and agents")[2]
     cells = dict(re.findall(r'data-name="([^"]+)">([^<]*)', text.partition("</table>")[0]))
     assert cells["success, %"].startswith("100.0 [29.") and cells["success, %"].endswith(", 100.0]")
     assert cells["steps"] == "12" and cells["within 1.5 shortest paths"].startswith("0.50 [")

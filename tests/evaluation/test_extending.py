@@ -22,7 +22,7 @@ def test_a_figure_with_its_number_is_one_file_and_one_line(small_ladders, tmp_pa
     templates = shutil.copytree(str(resources.files("hypogoal.evaluation") / "templates"), tmp_path / "templates")
     shutil.copy(EXAMPLES / "durations.html", templates)
     monkeypatch.setattr(page, "TEMPLATES", templates)
-    *others, _ = questions.QUESTIONS[:4]
+    *others, _ = questions.QUESTIONS[:5]
     durations = questions.Question(importlib.import_module("durations"))
     monkeypatch.setattr(questions, "QUESTIONS", [*others, durations])
     evaluate(small_ladders, quiet=True)

@@ -45,7 +45,7 @@ def table_of(run, name):
 def test_the_page_opens_with_a_verdict_of_its_numbers(ladders):
     """Spec I1: options of several members against those of one classifier, recomputed from ``numbers.csv``."""
     task = "The reward and the end of an episode are those of the domain 'ladder_run:DOMAIN'"
-    alike = "Several hypotheses made no difference on these 2 ladders: options"
+    alike = "Having several hypotheses made no difference on these 2 ladders: options"
     agrees(ladders, task, alike, "Fewer than six layouts or seeds are not evidence")
 
 
@@ -166,15 +166,15 @@ def test_the_terminal_summary_fits(ladders, results):
 def test_the_page_shows_ladders_and_nothing_of_agents(ladders, page):
     """Spec F7: its sections, Figures 2 to 5 with seeds, intervals, and what the paper claims; no empty section."""
     assert re.findall(r"<h2>(.*?)</h2>", page) == [
-        "Hypotheses in rooms without labels", "Options on ladders", "What members look at",
+        "What the hypotheses say", "Hypotheses in rooms without labels", "Options on ladders", "What members look at",
         "Data, settings, provenance",
     ]  # fmt: skip
     assert page.count("<figure") == 5
-    assert "–: no unseen room has positives left" in page
-    assert "mean over ladders (1L and 2-6) and over seeds (0 and 1)" in page
-    assert "Missing in this run" not in page
+    assert "A dash means that no unseen room has positives left" in page
+    assert "averaged over the ladders 1L and 2-6 and over the seeds 0 and 1" in page
+    assert "This run lacks" not in page
     names = {path.stem for path in (ladders / "report" / "figures").iterdir()}
-    assert names == {"figure2", "figure3", "figure4", "figure5-1L", "figure5-2-6", "figure9"}
+    assert names == {"figure2", "figure3", "figure4", "figure5-1L", "figure5-2-6"}, "Figure 9 is drawn once asked for"
 
 
 def test_ensembles_alone(ladders, tmp_path):
@@ -201,7 +201,7 @@ def test_options_without_their_ensembles_evaluation(ladders, tmp_path):
     assert (NONE, 2, "validated") not in table.index
     page = (report(tmp_path).path / "index.html").read_text(encoding="utf-8")
     assert "<li>no ensemble</li>" in page
-    assert "The paper's Figure 5: ladder 2-6, first seed" in page
+    assert "Figure 5 for ladder 2-6 and the first seed" in page
 
 
 def test_a_damaged_table_is_one_line(small_ladders):

@@ -112,6 +112,7 @@ def test_it_is_a_sentence_below_the_verdict() -> None:
     nothing = {"findings": [], "agents": {}, "ladders": False, "solved": {}}
     *_, line = page.lines_of("verdict.txt", **nothing, undecided=[found])
     assert line == (
-        "After 60 episodes agent cannot tell which is better for lamp, member 0 or 2 (values differ by 0.05"
-        " [-0.20, 0.30]). Labels of the unlabelled states 7, 3 of data.h5 would tell."
+        "After 60 episodes agent cannot tell whether member 0 or 2 is better for lamp, because their values differ by "
+        "0.05 with a 95 % interval from -0.20 to 0.30. So label the unlabelled states 7, 3 of data.h5: these labels "
+        "would tell."
     )

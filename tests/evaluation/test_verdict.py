@@ -70,18 +70,19 @@ def test_seeds_are_the_units_of_a_single_layout() -> None:
     played = {SEVERAL: [1.0, 0.9, 1.0], UNIFORM: [0.5, 0.4, 0.45]}
     sentence, warning = sentences(run_of({SEVERAL: [0.0]}, played, layouts=False))
     assert sentence == (
-        "Choosing mattered on these 3 seeds: the agent solves 97 % of the episodes, uniform-random choice among its "
-        "own options 45 % (+50 points in the median, 50 to 55)."
+        "Choosing mattered on these 3 seeds: the agent solves 97 % of the episodes, but uniform-random choice among "
+        "its own options solves 45 %. The difference is +50 points in the median of the seeds, and from 50 to 55 over "
+        "all of them."
     )
-    assert warning == "Fewer than six layouts or seeds are not evidence: train more."
+    assert warning == "Fewer than six layouts or seeds are not evidence, so train more."
     several = {SEVERAL: [1.0] * 6, UNIFORM: [0.5, 0.4, 0.45] * 2}
     (sentence,) = sentences(run_of({SEVERAL: [0.0]}, several, layouts=False))
-    assert sentence.startswith("Choosing mattered over 6 seeds:") and sentence.endswith(
-        "(+55 points in the median [50, 60])."
+    assert sentence.startswith("Choosing mattered on 6 seeds:") and sentence.endswith(
+        "+55 points in the median of the seeds, with a 95 % interval from 50 to 60."
     )
     one = sentences(run_of({SEVERAL: [0.0]}, {SEVERAL: [1.0], UNIFORM: [0.5]}))
     assert one[0].startswith("Choosing mattered on this layout:") and "points" not in one[0]
-    assert one[1] == "One run is not evidence: train more layouts or seeds."
+    assert one[1] == "One run is not evidence, so train more layouts or seeds."
 
 
 def test_the_verdict_says_after_how_many_episodes() -> None:
@@ -93,12 +94,23 @@ def test_the_verdict_says_after_how_many_episodes() -> None:
         rows += [row("success", 1.0, method=SEVERAL, scope=FROZEN, **place)]
         rows += [row("success", 0.2, method=UNIFORM, scope=FROZEN, **place)]
         rows += [] if episodes is None else [row("episodes_to_95", episodes, method=SEVERAL, **place)]
-    first, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
-    assert first.endswith("After 40 episodes in the median it solved 95 % of the last twenty, in 75 % of its runs.")
+    _, told, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
+    assert told.startswith("The reward told the agent what to do within 40 episodes in the median")
+    assert told.endswith("That happened in 75 % of its runs.")
+
+
+def test_the_verdict_says_that_the_reward_has_not_told() -> None:
+    """In how many episodes of training it has not."""
+    place = {"method": SEVERAL, "layout": 0, "seed": 0, "artefact": "own"}
+    rows = [row("success", 0.4, **place), row("episodes", 812, **place), row("success", 0.4, **place, scope=FROZEN)]
+    rows += [row("success", 0.2, **{**place, "method": UNIFORM}, scope=FROZEN)]
+    _, told, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
+    assert told.startswith("The reward has not told the agent what to do: in 812 episodes of training it never")
 
 
 @pytest.mark.parametrize(
-    ("better", "said"), [(0.55, "it chose sub-goals, not hypotheses."), (0.9, "it chose among hypotheses, too.")]
+    ("better", "said"),
+    [(0.55, "So it chose between sub-goals, not between hypotheses."), (0.9, "So it chose between hypotheses, too.")],
 )
 def test_choosing_sub_goals_is_told_from_choosing_among_members(better: float, said: str) -> None:
     """By how often the better of two members is taken, against uniform-random choice among the same options."""
@@ -106,10 +118,12 @@ def test_choosing_sub_goals_is_told_from_choosing_among_members(better: float, s
     for method, solved, share in ((SEVERAL, 1.0, better), (UNIFORM, 0.27, 0.48)):
         place = {"method": method, "scope": FROZEN, "layout": 7, "seed": 0, "artefact": "own"}
         rows += [row("success", solved, **place), row("pair", share, **place)]
-    first, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
-    shares = f"takes the better one in {better:.0%} of the cases, uniform-random choice in 48%".replace("%", " %")
-    assert first.startswith("Choosing mattered on this layout: the agent solves 100 %") and first.endswith(said)
-    assert shares in first
+    first, second, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
+    shares = f"takes the better one in {better:.0%} of the cases, and uniform-random choice does in 48%".replace(
+        "%", " %"
+    )
+    assert first.startswith("Choosing mattered on this layout: the agent solves 100 %") and second.endswith(said)
+    assert shares in second
 
 
 def test_without_frozen_play_an_agent_is_compared_with_one_that_chose_at_random() -> None:
@@ -171,16 +185,16 @@ def test_options_on_ladders_are_compared_by_the_member_that_validation_picks() -
     rows = [each for seed in range(3) for each in ladder("D-BAT, 2 members", seed, 0.0, 0.9, validated=1)]
     rows += [each for seed in range(3) for each in ladder(ONE, seed, 0.1, validated=None)]
     sentence, _ = sentences(results_of(*rows))
-    assert sentence.startswith("Several hypotheses mattered on these 3 seeds: options of D-BAT, 2 members stop")
-    assert "in 90 % of the executions, those of one classifier in 10 %" in sentence
+    assert sentence.startswith("Having several hypotheses mattered on these 3 seeds: options of D-BAT, 2 members stop")
+    assert "in 90 % of the executions, but those of one classifier do in 10 %" in sentence
     (alone,) = sentences(results_of(*ladder("D-BAT, 2 members", 0, 0.25)))
-    assert "unknown: the run has no options of one classifier" in alone
+    assert "unknown, because the run has no options of one classifier" in alone
 
 
 def test_without_controls_nothing_is_claimed() -> None:
     lines = sentences(run_of({SEVERAL: [0.5]}))
-    assert lines[0] == "D-BAT, 3 members: 50 % of the last training episodes solved." and "unknown" in lines[1]
-    assert sentences(results_of(agents=AGENTS)) == ["No episode of an agent has ended yet: train with more steps."]
+    assert lines[0] == "D-BAT, 3 members solved 50 % of the last training episodes." and "unknown" in lines[1]
+    assert sentences(results_of(agents=AGENTS)) == ["No episode of an agent has ended yet, so train with more steps."]
 
 
 def test_an_ensemble_alone_has_shown_nothing_yet() -> None:

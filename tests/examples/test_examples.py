@@ -128,7 +128,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path) -> None:
     config = json.loads((ensemble / "manifest.json").read_text(encoding="utf-8"))["config"]
     assert [config[key] for key in ("network", "observation_shape", "observation_dtype")] == ["mlp", [6], "float32"]
     page = (folder / "report" / "index.html").read_text(encoding="utf-8")
-    assert 'id="figure-features' in page and "States to look through" not in page
+    assert 'id="figure-features' in page and "held-out states that were looked at" not in page
     drawn = "".join(path.read_text(encoding="utf-8") for path in (folder / "report/figures").glob("features*.svg"))
     assert "position[0]" in drawn and "held[1]" in drawn
     agrees(folder, OWN_TASK, UNKNOWN)

@@ -81,7 +81,7 @@ def test_the_page_shows_both(compared):
     """Spec F7: curves, every agent in the table, one file, its inputs known."""
     text = (compared / "index.html").read_text(encoding="utf-8")
     titles = re.findall(r"<h3[^>]*>(.*?)</h3>", text)
-    assert titles == ["Seed by seed", "Summary", "What differs"]
+    assert titles == ["Methods compared run by run", "Summary", "What differs"]
     assert "DQN tuned" in text and "within 1.5 shortest paths</th>" in text
     assert text.count("<figure") == 1 and not re.search(r'(?:src|href)="(?!#|data:)', text)
     artefact = open_artefact(compared, "comparison")

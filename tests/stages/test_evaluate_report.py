@@ -45,7 +45,7 @@ def test_the_page_opens_with_the_task_and_a_verdict_of_its_numbers(tiny_run):
     """Spec I1: recomputed from ``numbers.csv``."""
     agrees(tiny_run, "Take the red key, open the red door and reach the goal", "One run is not")
     page = (tiny_run / "report" / "index.html").read_text()
-    assert 'The latter is under <a href="#choosing">What choosing is worth</a>.' in page and 'id="choosing"' in page
+    assert '<a href="#choosing">What choosing is worth</a>.' in page and 'id="choosing"' in page
 
 
 def test_agents_are_grouped_and_counted_whole(tiny_run, results):
@@ -174,17 +174,17 @@ def test_the_page_shows_all_of_it_each_time_the_same(tiny_run, tiny_copy):
     page = page_of(tiny_copy, force=True)
     assert page == (tiny_run / "report" / "index.html").read_text(encoding="utf-8")
     for title in (
-        "Summary", "Hypotheses",
+        "What the hypotheses say", "Summary", "Hypotheses",
         "Which hypotheses are chosen, and where they stop", "What members look at", "Data, settings, provenance",
     ):  # fmt: skip
         assert f"<h2>{title}</h2>" in page
     names = [path.name for path in (tiny_run / "report" / "figures").iterdir()]
     assert {"figure6.svg", "members.svg", "figure7.svg"} <= {*names}
     assert page.count("data:image/gif;base64,") == 1
-    assert re.search(r"Episode \d of meta, layout 100: \d+ steps", page)
-    assert page.count("<h3>Seed by seed") == 1, "one run of an agent is no table of pairs"
-    assert "Layouts: 100; run seeds: 0." in page
-    assert "Missing in this run" not in page
+    assert re.search(r"Episode \d of meta on layout 100 has \d+ steps", page)
+    assert page.count("<h3>Methods compared run by run") == 1, "one run of an agent is no table of pairs"
+    assert "The layout is 100, and the run seed is 0." in page
+    assert "This run lacks" not in page
 
 
 def test_what_changed_since_is_said(tiny_copy):

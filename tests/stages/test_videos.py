@@ -96,7 +96,7 @@ def test_what_is_drawn_of_a_frame():
     stack[..., 3] = 200
     frame = Frame(stack, 12, 3, (True, False), 5, "")
     lines = frame_lines(frame, ["red", "door"], 2)
-    assert lines == ["option: door", "  member 0: positive", "> member 1: negative", "step 12"]
+    assert lines == ["option: door", "  member 0: reached", "> member 1: not reached", "step 12"]
     picture = np.asarray(draw_frame(frame, ["red", "door"], 2, timeout=10))
     assert picture.shape[1] == 336 and (picture[:336] == 200).all()
     bar = picture[336]
