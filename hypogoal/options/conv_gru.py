@@ -84,9 +84,9 @@ class PaperQNetwork(nn.Module):
         """
         state = seen.new_zeros(len(windows), self.HIDDEN)
         for place, images in enumerate(windows.unbind(1)):
-            following = self._next(seen.index_select(0, images), state)
-            is_real = (lengths > place)[:, None]
-            state = torch.where(is_real, following, state)
+            (real,) = (lengths > place).nonzero(as_tuple=True)
+            following = self._next(seen.index_select(0, images[real]), state.index_select(0, real))
+            state = state.index_copy(0, real, following)
         return self.values(state)
 
     def _next(self, seen: Tensor, state: Tensor) -> Tensor:
