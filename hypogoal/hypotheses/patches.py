@@ -101,10 +101,10 @@ def make_tables(network: nn.Sequential, *parts: Array) -> Tables | None:
     pixels = prod(parts[0].shape[1:3])
     count = max(1, min(SAMPLE, SAMPLE_PIXELS // pixels))
     some = [part[spread_rows(len(part), count)] for part in parts]
-    sample = _tables(np.concatenate(some), windows)
+    sample = tables_of(np.concatenate(some), windows)
     if not _worthwhile(sample, network):
         return None
-    return _tables(np.concatenate(parts), windows)
+    return tables_of(np.concatenate(parts), windows)
 
 
 def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
@@ -120,11 +120,14 @@ def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
     return tabled < WORTHWHILE * plain
 
 
-def _tables(
+def tables_of(
     observations: Bytes,
     windows: Sequence[tuple[int, int]],
 ) -> Tables:
-    """The distinct patches of images, level by level: strips of distinct rows, bands of rows, then strips in bands."""
+    """The distinct patches of images, uint8 (N, H, W, C), in ``windows_of`` a network, whether or not many repeat.
+
+    Level by level: strips of distinct rows, bands of rows, then strips in bands.
+    """
     count, height, width, channels = observations.shape
     lines, pixel_rows = _distinct_items(
         observations.reshape(

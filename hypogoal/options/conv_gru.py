@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from hypogoal.core.arrays import Bools, Columns, Ints, tensor
+from hypogoal.core.arrays import Bools, Bytes, Columns, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
+from hypogoal.hypotheses import patches
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import double_dqn, saved
 from hypogoal.options.config import STACK, OptionConfig, PaperConfig
@@ -62,14 +63,23 @@ class PaperQNetwork(nn.Module):
             nn.Linear(128, actions),
         )
 
-    def see(self, images: Tensor) -> Tensor:
-        """uint8 (N, H, W, C) -> what the GRU's three gates take from each, float32 (N, 3 * ``HIDDEN``).
+    def see(self, images: Tensor | patches.PatchBatch) -> Tensor:
+        """uint8 (N, H, W, C), or their patches -> what the GRU's gates take from each, float32 (N, 3 * ``HIDDEN``).
 
         Nearly all of the arithmetic: so an image of many windows is looked at once, which ``nn.GRU`` cannot do.
         """
         weight, _, bias, _ = self.gru.all_weights[0]
-        pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return linear(self.features(pixels), weight, bias)
+        if isinstance(images, patches.PatchBatch):
+            features = patches.forward(self.features, images)
+        else:
+            features = self.features(images.permute(0, 3, 1, 2).float() / 255.0)
+        return linear(features, weight, bias)
+
+    def patches_of(self, images: Bytes) -> patches.PatchBatch:
+        """The distinct patches of images uint8 (N, H, W, C) made of few tiles: :meth:`see` computes each once."""
+        windows = patches.windows_of(self.features)
+        assert windows
+        return patches.take(patches.tables_of(images, windows), np.arange(len(images)))
 
     def forward(
         self,
@@ -182,6 +192,7 @@ class PaperLearner(Learner):
             self.members.append(Member(network.to(self.device), settings))
         self.windows = np.zeros((self.engine.count, settings.recurrence), int)  # of running executions
         self.lengths = np.zeros(self.engine.count, int)  # theirs; the places behind have states of the window
+        self._by_patches = self.engine.tiles is not None and self.device.type == "cpu"
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
@@ -213,16 +224,15 @@ class PaperLearner(Learner):
             network = self.members[option].online.eval()
             images, places = self._seen(windows[rows])
             lengths = tensor(self.lengths[rows], self.device)
-            values = network(network.see(images), places, lengths)
+            values = network(network.see(tensor(images, self.device)), places, lengths)
             preferred = values.argmax(1)
             chosen[rows] = preferred.cpu().numpy()
         return chosen
 
-    def _seen(self, windows: Ints) -> tuple[Tensor, Tensor]:
+    def _seen(self, windows: Ints) -> tuple[Bytes, Tensor]:
         """The distinct images in windows, and which one each place has."""
         states, places = np.unique(windows, return_inverse=True)
-        images = tensor(self.engine.images(states), self.device)
-        return images, tensor(places.reshape(windows.shape), self.device)
+        return self.engine.images(states), tensor(places.reshape(windows.shape), self.device)
 
     def observe(self, moved: Transitions) -> None:
         path = np.column_stack([self.windows, moved.next_ids])
@@ -263,14 +273,14 @@ class PaperLearner(Learner):
         lengths = tensor(length, self.device)
         later_lengths = tensor(np.minimum(length + 1, most), self.device)
         both = np.stack([now, following])
-        images, places = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
-        before, after = places
+        images, (before, after) = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
         online, target = member.online.train(), member.target
-        seen = online.see(images)
+        shown = online.patches_of(images) if self._by_patches else tensor(images, self.device)
+        seen = online.see(shown)
         values = online(seen, before, lengths)
         with torch.no_grad():
             next_online = online(seen, after, later_lengths)
-            next_target = target(target.see(images), after, later_lengths)
+            next_target = target(target.see(shown), after, later_lengths)
 
         next_states = path[np.arange(len(path)), length]
         reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]

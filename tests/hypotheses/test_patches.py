@@ -51,7 +51,7 @@ def test_groups_pass_together_and_batchnorm_sees_them_apart(name: str, counted: 
 
 def double_batch(images: NDArray[np.uint8], network: nn.Sequential, *groups: NDArray[np.int64]) -> patches.PatchBatch:
     """A batch in double precision."""
-    batch = patches.take(patches._tables(images, patches.windows_of(network) or []), *groups)
+    batch = patches.take(patches.tables_of(images, patches.windows_of(network) or []), *groups)
     shares = [[(share.double(), places) for share, places in level] for level in batch.shares]
     return dataclasses.replace(batch, colours=batch.colours.double(), shares=shares)
 
@@ -85,7 +85,7 @@ def compare(plain: nn.Sequential, expected: torch.Tensor, tabled: nn.Sequential,
 def test_tables_by_hand() -> None:
     """Two 3x3 images of two colours, windows of 2x2: four distinct windows at 8 places."""
     ink = np.array([[[1, 1, 1], [1, 1, 1], [1, 1, 0]], [[1, 1, 1], [1, 1, 1], [1, 1, 1]]], dtype=np.uint8)
-    tables = patches._tables(ink[..., None] * 255, [(2, 1)])
+    tables = patches.tables_of(ink[..., None] * 255, [(2, 1)])
     colour_of = tables.colours[:, 0].tolist()
     assert sorted(colour_of) == [0.0, 1.0]
     (level,) = tables.levels
