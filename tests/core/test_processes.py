@@ -1,6 +1,7 @@
 """Work in other processes: how many there may be, how they end."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -10,7 +11,9 @@ from math import inf
 from pathlib import Path
 
 import pytest
+import torch
 
+from hypogoal.core import processes
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import CORES, allowed, cores, in_processes, quota, stop
 
@@ -137,3 +140,17 @@ def test_processes_without_shared_memory_are_refused(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("multiprocessing.synchronize._multiprocessing.SemLock", refuse)
     with pytest.raises(UserError, match=r"Read-only file system.*/dev/shm. Make .* give HYPOGOAL_CORES=1"):
         in_processes([die, die], 2, ignore)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="is told to GNU's C library")
+def test_a_stage_takes_the_memory_of_freed_tensors_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next tensor is as large and gets no page from the system; after the stage memory is managed as before."""
+    managed, told = processes.keep_freed, []
+    monkeypatch.setattr(processes, "keep_freed", lambda keep: (told.append(keep), managed(keep)))
+    with processes.own_settings():
+        processes.prepare()
+        torch.ones(2**24)  # 64 MiB
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        torch.ones(2**24)
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before < 100
+    assert told == [True, False]
