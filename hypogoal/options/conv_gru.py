@@ -5,7 +5,6 @@ from its first state on, with nothing remembered; so it does in acting, in learn
 1 is a state alone (DEV-16).
 """
 
-import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -14,8 +13,7 @@ from functools import partial
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn.functional import linear
+from torch import Tensor
 
 from hypogoal.core.arrays import Bools, Bytes, Columns, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
@@ -23,92 +21,12 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
 from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
-from hypogoal.hypotheses import patches
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import double_dqn, saved
 from hypogoal.options.config import STACK, OptionConfig, PaperConfig
 from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.paper_network import PaperQNetwork
 from hypogoal.options.replay import PrioritisedReplay
-
-
-class PaperQNetwork(nn.Module):
-    """Two of (convolution, BatchNorm, ReLU, pooling), a GRU, two dense layers.
-
-    The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
-    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU stands behind pooling: the same function, cheaper.
-    """
-
-    HIDDEN = 512
-
-    def __init__(self, observation_shape: tuple[int, ...], actions: int):
-        super().__init__()
-        height, width, depth = observation_shape
-        self.features = nn.Sequential(
-            nn.Conv2d(depth, 16, 3),
-            nn.BatchNorm2d(16),
-            nn.MaxPool2d(2),
-            nn.ReLU(),
-            nn.Conv2d(16, 32, 3),
-            nn.BatchNorm2d(32),
-            nn.MaxPool2d(2),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
-        sides = [((side - 2) // 2 - 2) // 2 for side in (height, width)]
-        inputs = 32 * math.prod(sides)
-        self.gru = nn.GRU(inputs, self.HIDDEN, batch_first=True)
-        self.values = nn.Sequential(
-            nn.Linear(self.HIDDEN, 128),
-            nn.ReLU(),
-            nn.Linear(128, actions),
-        )
-
-    def see(self, images: Tensor | patches.PatchBatch) -> Tensor:
-        """uint8 (N, H, W, C), or their patches -> what the GRU's gates take from each, float32 (N, 3 * ``HIDDEN``).
-
-        Nearly all of the arithmetic: so an image of many windows is looked at once, which ``nn.GRU`` cannot do.
-        """
-        weight, _, bias, _ = self.gru.all_weights[0]
-        if isinstance(images, patches.PatchBatch):
-            features = patches.forward(self.features, images)
-        else:
-            features = self.features(images.permute(0, 3, 1, 2).float() / 255.0)
-        return linear(features, weight, bias)
-
-    def patches_of(self, images: Bytes) -> patches.PatchBatch:
-        """The distinct patches of images uint8 (N, H, W, C) made of few tiles: :meth:`see` computes each once."""
-        windows = patches.windows_of(self.features)
-        assert windows
-        return patches.take(patches.tables_of(images, windows), np.arange(len(images)))
-
-    def forward(
-        self,
-        seen: Tensor,
-        windows: Tensor,
-        lengths: Tensor,
-    ) -> Tensor:
-        """Values float32 (n, A) of the last states of windows.
-
-        ``windows`` int64 (n, T) say which of the images :meth:`see` saw each window has; of its T places the first
-        ``lengths`` (n,) are real.
-        """
-        state = seen.new_zeros(len(windows), self.HIDDEN)
-        for place, images in enumerate(windows.unbind(1)):
-            (real,) = (lengths > place).nonzero(as_tuple=True)
-            following = self._next(seen.index_select(0, images[real]), state.index_select(0, real))
-            state = state.index_copy(0, real, following)
-        return self.values(state)
-
-    def _next(self, seen: Tensor, state: Tensor) -> Tensor:
-        """The GRU's state (n, ``HIDDEN``) after one more image, by the equations of ``nn.GRU``."""
-        _, weight, _, bias = self.gru.all_weights[0]
-        remembered = linear(state, weight, bias)
-        reset_of_image, update_of_image, new_of_image = seen.chunk(3, dim=1)
-        reset_of_state, update_of_state, new_of_state = remembered.chunk(3, dim=1)
-        reset = (reset_of_image + reset_of_state).sigmoid()
-        update = (update_of_image + update_of_state).sigmoid()
-        new = (new_of_image + reset * new_of_state).tanh()
-        return torch.lerp(new, state, update)
 
 
 @dataclass(frozen=True)
@@ -192,7 +110,7 @@ class PaperLearner(Learner):
             self.members.append(Member(network.to(self.device), settings))
         self.windows = np.zeros((self.engine.count, settings.recurrence), int)  # of running executions
         self.lengths = np.zeros(self.engine.count, int)  # theirs; the places behind have states of the window
-        self._by_patches = self.engine.tiles is not None and self.device.type == "cpu"
+        self._in_pieces = self.engine.tiles is not None and self.device.type == "cpu"
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
@@ -275,7 +193,7 @@ class PaperLearner(Learner):
         both = np.stack([now, following])
         images, (before, after) = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
         online, target = member.online.train(), member.target
-        shown = online.patches_of(images) if self._by_patches else tensor(images, self.device)
+        shown = online.pieces_of(images) if self._in_pieces else tensor(images, self.device)
         seen = online.see(shown)
         values = online(seen, before, lengths)
         with torch.no_grad():
@@ -307,7 +225,7 @@ class PaperLearner(Learner):
     def weights(self) -> dict[str, Tensor]:
         tensors = {}
         for option, member in enumerate(self.members):
-            for name, value in member.online.state_dict().items():
+            for name, value in member.online.tensors().items():
                 tensors[f"{option}.{name}"] = value
         return tensors
 
