@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hypogoal.core.arrays import Bools, Bytes, Columns, Ints, tensor
+from hypogoal.core import tensors
+from hypogoal.core.arrays import Bools, Columns, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import double_dqn, saved
@@ -61,8 +61,8 @@ class PaperPolicies:
         self.recurrence = options.config["recurrence"]
         actions = len(options.weights.get("0.values.2.bias", ())) or 1  # any, where weights are missing
         make = partial(PaperQNetwork, options.shape, actions)
-        each = [below(f"{option}.", options.weights) for option in range(options.count)]
-        self.networks = [load_fitting(make, weights, saved.FILE).eval() for weights in each]
+        each = [tensors.below(f"{option}.", options.weights) for option in range(options.count)]
+        self.networks = [tensors.load_fitting(make, weights, saved.FILE).eval() for weights in each]
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
@@ -147,7 +147,7 @@ class PaperLearner(Learner):
             chosen[rows] = preferred.cpu().numpy()
         return chosen
 
-    def _seen(self, windows: Ints) -> tuple[Bytes, Tensor]:
+    def _seen(self, windows: Ints) -> tuple[Observations, Tensor]:
         """The distinct images in windows, and which one each place has."""
         states, places = np.unique(windows, return_inverse=True)
         return self.engine.images(states), tensor(places.reshape(windows.shape), self.device)
@@ -223,12 +223,12 @@ class PaperLearner(Learner):
         return updated
 
     def weights(self) -> dict[str, Tensor]:
-        tensors = {}
+        every = {}
         for option, member in enumerate(self.members):
             for name, value in member.online.tensors().items():
-                tensors[f"{option}.{name}"] = value
-        return tensors
+                every[f"{option}.{name}"] = value
+        return every
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         for option, member in enumerate(self.members):
-            member.load(below(f"{option}.", weights), f"option {option} of {saved.FILE}")
+            member.load(tensors.below(f"{option}.", weights), f"option {option} of {saved.FILE}")
