@@ -88,8 +88,12 @@ check: $(STAMP) ## linter, formatter, types, import contracts, vague names, publ
 	$(BIN)/python -m tests.vague_names
 	$(BIN)/python -m studies.recompute
 
-bench: $(STAMP) ## what is faster than what, in ratios (BENCH=--short for a quick look, ONLY="doorkey loop")
+bench: $(STAMP) ## what is faster than what, in ratios (BENCH=--short for a quick look, ONLY="doorkey loop", OTHER=CHECKOUT beside it)
+ifdef OTHER
+	$(BIN)/python -m benchmarks.beside $(OTHER) --only $(ONLY) $(BENCH)
+else
 	for name in $(ONLY); do $(BIN)/python -m benchmarks.$$name $(BENCH) || exit 1; done
+endif
 
 docs: $(STAMP) ## the documentation as a site, in site/
 	$(BIN)/python -m mkdocs build --strict

@@ -76,7 +76,7 @@ def trusted(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def small_gru(monkeypatch: pytest.MonkeyPatch) -> None:
     """The paper's option networks with a GRU of 32 units instead of 512: 10.5 M parameters each say no more."""
-    from hypogoal.options.conv_gru import PaperQNetwork
+    from hypogoal.options.paper_network import PaperQNetwork
 
     monkeypatch.setattr(PaperQNetwork, "HIDDEN", 32)
 

@@ -104,10 +104,10 @@ def make_tables(network: nn.Sequential, *parts: Array) -> Tables | None:
     pixels = prod(parts[0].shape[1:3])
     count = max(1, min(SAMPLE, SAMPLE_PIXELS // pixels))
     some = [part[spread_rows(len(part), count)] for part in parts]
-    sample = _tables(np.concatenate(some), windows)
+    sample = tables_of(np.concatenate(some), windows)
     if not _worthwhile(sample, network):
         return None
-    return _tables(np.concatenate(parts), windows)
+    return tables_of(np.concatenate(parts), windows)
 
 
 def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
@@ -126,13 +126,14 @@ def _worthwhile(sample: Tables, network: nn.Sequential) -> bool:
     return tabled < WORTHWHILE * plain
 
 
-def _tables(
+def tables_of(
     observations: Bytes,
     windows: Sequence[tuple[int, int]],
 ) -> Tables:
-    """Return the distinct patches of images, level by level.
+    """Return the distinct patches of images, uint8 (N, H, W, C), in ``windows_of`` a network, level by level.
 
-    At each level, the steps find strips of distinct rows, then bands of rows, then strips in bands.
+    It does not matter whether many patches repeat. At each level, the steps find strips of distinct rows, then bands
+    of rows, then strips in bands.
     """
     count, height, width, channels = observations.shape
     lines, pixel_rows = _distinct_items(

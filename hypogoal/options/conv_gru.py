@@ -5,7 +5,6 @@ from its first state on, with nothing remembered; so it does in acting, in learn
 1 is a state alone (DEV-16).
 """
 
-import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -14,91 +13,20 @@ from functools import partial
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
-from torch.nn.functional import linear
+from torch import Tensor
 
+from hypogoal.core import tensors
 from hypogoal.core.arrays import Bools, Columns, Ints, tensor
 from hypogoal.core.drawing import DrawsFrom
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import torch_generator
-from hypogoal.core.tensors import below, load_fitting
 from hypogoal.domains.base import Engine
 from hypogoal.observations import PICTURE, Observations
 from hypogoal.options import double_dqn, saved
 from hypogoal.options.config import STACK, OptionConfig, PaperConfig
 from hypogoal.options.learner import Learner, Transitions
+from hypogoal.options.paper_network import PaperQNetwork
 from hypogoal.options.replay import PrioritisedReplay
-
-
-class PaperQNetwork(nn.Module):
-    """Two of (convolution, BatchNorm, ReLU, pooling), a GRU, two dense layers.
-
-    The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
-    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU stands behind pooling: the same function, cheaper.
-    """
-
-    HIDDEN = 512
-
-    def __init__(self, observation_shape: tuple[int, ...], actions: int):
-        super().__init__()
-        height, width, depth = observation_shape
-        self.features = nn.Sequential(
-            nn.Conv2d(depth, 16, 3),
-            nn.BatchNorm2d(16),
-            nn.MaxPool2d(2),
-            nn.ReLU(),
-            nn.Conv2d(16, 32, 3),
-            nn.BatchNorm2d(32),
-            nn.MaxPool2d(2),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
-        sides = [((side - 2) // 2 - 2) // 2 for side in (height, width)]
-        inputs = 32 * math.prod(sides)
-        self.gru = nn.GRU(inputs, self.HIDDEN, batch_first=True)
-        self.values = nn.Sequential(
-            nn.Linear(self.HIDDEN, 128),
-            nn.ReLU(),
-            nn.Linear(128, actions),
-        )
-
-    def see(self, images: Tensor) -> Tensor:
-        """uint8 (N, H, W, C) -> what the GRU's three gates take from each, float32 (N, 3 * ``HIDDEN``).
-
-        Nearly all of the arithmetic: so an image of many windows is looked at once, which ``nn.GRU`` cannot do.
-        """
-        weight, _, bias, _ = self.gru.all_weights[0]
-        pixels = images.permute(0, 3, 1, 2).float() / 255.0
-        return linear(self.features(pixels), weight, bias)
-
-    def forward(
-        self,
-        seen: Tensor,
-        windows: Tensor,
-        lengths: Tensor,
-    ) -> Tensor:
-        """Values float32 (n, A) of the last states of windows.
-
-        ``windows`` int64 (n, T) say which of the images :meth:`see` saw each window has; of its T places the first
-        ``lengths`` (n,) are real.
-        """
-        state = seen.new_zeros(len(windows), self.HIDDEN)
-        for place, images in enumerate(windows.unbind(1)):
-            following = self._next(seen.index_select(0, images), state)
-            is_real = (lengths > place)[:, None]
-            state = torch.where(is_real, following, state)
-        return self.values(state)
-
-    def _next(self, seen: Tensor, state: Tensor) -> Tensor:
-        """The GRU's state (n, ``HIDDEN``) after one more image, by the equations of ``nn.GRU``."""
-        _, weight, _, bias = self.gru.all_weights[0]
-        remembered = linear(state, weight, bias)
-        reset_of_image, update_of_image, new_of_image = seen.chunk(3, dim=1)
-        reset_of_state, update_of_state, new_of_state = remembered.chunk(3, dim=1)
-        reset = (reset_of_image + reset_of_state).sigmoid()
-        update = (update_of_image + update_of_state).sigmoid()
-        new = (new_of_image + reset * new_of_state).tanh()
-        return torch.lerp(new, state, update)
 
 
 @dataclass(frozen=True)
@@ -133,8 +61,8 @@ class PaperPolicies:
         self.recurrence = options.config["recurrence"]
         actions = len(options.weights.get("0.values.2.bias", ())) or 1  # any, where weights are missing
         make = partial(PaperQNetwork, options.shape, actions)
-        each = [below(f"{option}.", options.weights) for option in range(options.count)]
-        self.networks = [load_fitting(make, weights, saved.FILE).eval() for weights in each]
+        each = [tensors.below(f"{option}.", options.weights) for option in range(options.count)]
+        self.networks = [tensors.load_fitting(make, weights, saved.FILE).eval() for weights in each]
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
         """Start an execution."""
@@ -182,6 +110,7 @@ class PaperLearner(Learner):
             self.members.append(Member(network.to(self.device), settings))
         self.windows = np.zeros((self.engine.count, settings.recurrence), int)  # of running executions
         self.lengths = np.zeros(self.engine.count, int)  # theirs; the places behind have states of the window
+        self._in_pieces = self.engine.tiles is not None and self.device.type == "cpu"
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
@@ -213,16 +142,15 @@ class PaperLearner(Learner):
             network = self.members[option].online.eval()
             images, places = self._seen(windows[rows])
             lengths = tensor(self.lengths[rows], self.device)
-            values = network(network.see(images), places, lengths)
+            values = network(network.see(tensor(images, self.device)), places, lengths)
             preferred = values.argmax(1)
             chosen[rows] = preferred.cpu().numpy()
         return chosen
 
-    def _seen(self, windows: Ints) -> tuple[Tensor, Tensor]:
+    def _seen(self, windows: Ints) -> tuple[Observations, Tensor]:
         """The distinct images in windows, and which one each place has."""
         states, places = np.unique(windows, return_inverse=True)
-        images = tensor(self.engine.images(states), self.device)
-        return images, tensor(places.reshape(windows.shape), self.device)
+        return self.engine.images(states), tensor(places.reshape(windows.shape), self.device)
 
     def observe(self, moved: Transitions) -> None:
         path = np.column_stack([self.windows, moved.next_ids])
@@ -263,14 +191,14 @@ class PaperLearner(Learner):
         lengths = tensor(length, self.device)
         later_lengths = tensor(np.minimum(length + 1, most), self.device)
         both = np.stack([now, following])
-        images, places = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
-        before, after = places
+        images, (before, after) = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
         online, target = member.online.train(), member.target
-        seen = online.see(images)
+        shown = online.pieces_of(images) if self._in_pieces else tensor(images, self.device)
+        seen = online.see(shown)
         values = online(seen, before, lengths)
         with torch.no_grad():
             next_online = online(seen, after, later_lengths)
-            next_target = target(target.see(images), after, later_lengths)
+            next_target = target(target.see(shown), after, later_lengths)
 
         next_states = path[np.arange(len(path)), length]
         reached = self.terminations.of_running(next_states, np.full_like(next_states, option))[:, None]
@@ -295,12 +223,12 @@ class PaperLearner(Learner):
         return updated
 
     def weights(self) -> dict[str, Tensor]:
-        tensors = {}
+        every = {}
         for option, member in enumerate(self.members):
-            for name, value in member.online.state_dict().items():
-                tensors[f"{option}.{name}"] = value
-        return tensors
+            for name, value in member.online.tensors().items():
+                every[f"{option}.{name}"] = value
+        return every
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         for option, member in enumerate(self.members):
-            member.load(below(f"{option}.", weights), f"option {option} of {saved.FILE}")
+            member.load(tensors.below(f"{option}.", weights), f"option {option} of {saved.FILE}")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import huber_loss
-from torch.nn.utils import clip_grad_norm_
+from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 
 from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Bools, Doubles, Floats, Ints, tensor
@@ -158,9 +158,11 @@ def descend(
         raise NumericalError(f"the loss of {owner} is {float(loss.detach())} {where}")
     optimiser.zero_grad()
     loss.backward()
-    norm = clip_grad_norm_(optimiser.weights, largest)
+    norm = get_total_norm([weight.grad for weight in optimiser.weights if weight.grad is not None])
     if not torch.isfinite(norm):
         raise NumericalError(f"a gradient of {owner} is {float(norm)} {where}")
+    if norm > largest:
+        clip_grads_with_norm_(optimiser.weights, largest, norm)
     optimiser.step()
 
 

@@ -51,7 +51,7 @@ def test_groups_pass_together_and_batchnorm_sees_them_apart(name: str, counted: 
 
 def double_batch(images: NDArray[np.uint8], network: nn.Sequential, *groups: NDArray[np.int64]) -> patches.PatchBatch:
     """A batch in double precision."""
-    batch = patches.take(patches._tables(images, patches.windows_of(network) or []), *groups)
+    batch = patches.take(patches.tables_of(images, patches.windows_of(network) or []), *groups)
     shares = [[(share.double(), places) for share, places in level] for level in batch.shares]
     return dataclasses.replace(batch, colours=batch.colours.double(), shares=shares)
 

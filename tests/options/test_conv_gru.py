@@ -1,5 +1,6 @@
 """The paper's network and its learner: windows of an execution, in learning, acting, out of files (Spec D2, D3)."""
 
+import copy
 import pickle
 from typing import Any
 
@@ -10,10 +11,12 @@ from corridor import Corridor, LongCorridor
 from option_loops import loop_of
 
 from hypogoal.core.errors import UserError
+from hypogoal.core.tensors import below
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options import double_dqn
-from hypogoal.options.conv_gru import Lived, PaperPolicies, PaperQNetwork
+from hypogoal.options.conv_gru import Lived, PaperPolicies
 from hypogoal.options.loop import OptionLoop
+from hypogoal.options.paper_network import PaperQNetwork
 from hypogoal.options.saved import SavedOptions
 
 STAY = 0
@@ -42,11 +45,12 @@ def test_windows_of_other_lengths_change_nothing() -> None:
     network = PaperQNetwork((64, 64, 3), 7).eval()
     windows, lengths = torch.tensor([[0, 1, 2, 3], [4, 2, 2, 2], [1, 1, 0, 0]]), torch.tensor([4, 2, 3])
     with torch.no_grad():
-        features = network.features(images.permute(0, 3, 1, 2) / 255.0)
+        features = network.features(images.permute(0, 3, 1, 2) / 255.0).flatten(1)
         seen = network.see(images)
         together = network(seen, windows, lengths)
         cell = torch.nn.GRUCell(features.shape[1], network.HIDDEN)
-        cell.load_state_dict({name.removesuffix("_l0"): value for name, value in network.gru.state_dict().items()})
+        weights = below("gru.", network.tensors())
+        cell.load_state_dict({name.removesuffix("_l0"): value for name, value in weights.items()})
         for row, length, values in zip(windows, lengths, together, strict=True):
             real = row[:length]
             alone = network(network.see(images[real]), torch.arange(len(real))[None], length[None])
@@ -57,6 +61,33 @@ def test_windows_of_other_lengths_change_nothing() -> None:
             torch.testing.assert_close(network.values(state)[0], values, atol=1e-5, rtol=0)
         shorter = network(seen, windows[:1, 1:], torch.tensor([3]))
     assert not torch.allclose(shorter[0], together[0], atol=1e-4), "what came before is of no account"
+
+
+@pytest.mark.usefixtures("small_gru")
+@pytest.mark.parametrize("training", [True, False])
+def test_distinct_patches_give_what_whole_images_give(training: bool) -> None:
+    """Values, gradients and BatchNorm's statistics are those of the plain computation."""
+    torch.manual_seed(0)
+    engine = DoorKeyEngine(100, 4)
+    for _ in range(5):
+        engine.step(np.array([0, 1, 2, 2]))
+    images = engine.images(np.arange(engine.n_states))
+    tabled = PaperQNetwork((64, 64, 3), 7).train(training)
+    plain = copy.deepcopy(tabled).double()  # for torch's BatchNorm of so many places is off by 1e-3 in float32
+    pixels = torch.from_numpy(images).permute(0, 3, 1, 2).double() / 255.0
+    seen, weights = plain.features(pixels).flatten(1), plain.tensors()["gru.weight_ih_l0"]
+    expected = torch.nn.functional.linear(seen, weights, plain.gru["bias_ih_l0"])
+    found = tabled.see(tabled.pieces_of(images))
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-4)
+    chosen = torch.randn(expected.shape)
+    (expected * chosen).sum().backward()
+    (found * chosen).sum().backward()
+    for (name, weight), same in zip(plain.named_parameters(), tabled.parameters(), strict=True):
+        if weight.grad is not None:
+            scale = max(10.0, weight.grad.norm().item())  # that of a bias before BatchNorm is 0
+            assert (same.grad - weight.grad).norm() <= 1e-4 * scale, name
+    for one, two in zip(plain.buffers(), tabled.buffers(), strict=True):
+        torch.testing.assert_close(two.to(one.dtype), one, rtol=0, atol=1e-6)
 
 
 def test_the_papers_sizes() -> None:

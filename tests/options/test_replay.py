@@ -1,6 +1,7 @@
 """Prioritised replay, transitions over several steps, and Double-DQN targets (Spec D2, D3)."""
 
 import copy
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from hypogoal.core.adam import Adam
 from hypogoal.core.arrays import Columns
 from hypogoal.options.config import LearnerConfig
-from hypogoal.options.double_dqn import SOFT, DoubleDQN, ReplayBatch, double_q_targets, linear_epsilon
+from hypogoal.options.double_dqn import SOFT, DoubleDQN, ReplayBatch, descend, double_q_targets, linear_epsilon
 from hypogoal.options.replay import PrioritisedReplay, Steps, StepsAhead
 
 
@@ -97,6 +99,18 @@ def test_the_target_follows_with_everything(interval: int) -> None:
             wanted = before[name] + rate * (new - before[name]) if value.is_floating_point() else value
             torch.testing.assert_close(value, wanted)
     assert any(not torch.equal(value, first[name]) for name, value in learning.target.state_dict().items())
+
+
+@pytest.mark.parametrize("largest", [1e-3, 1e3, math.inf])
+def test_gradients_are_cut_as_torch_cuts_them(largest: float) -> None:
+    """The same bytes, though gradients within the norm are left alone."""
+    ours = torch.nn.Linear(5, 3)
+    theirs = copy.deepcopy(ours)
+    descend(ours(torch.ones(1, 5)).square().sum(), Adam(ours.parameters(), 0.1), "it", "here", largest)
+    theirs(torch.ones(1, 5)).square().sum().backward()
+    torch.nn.utils.clip_grad_norm_(theirs.parameters(), largest)
+    for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.equal(one.grad, other.grad)
 
 
 def test_epsilon_falls_linearly() -> None:

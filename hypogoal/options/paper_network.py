@@ -1,0 +1,140 @@
+"""The paper's network of an option, and how it sees images that are made of few distinct patches."""
+
+import math
+from collections.abc import MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from hypogoal.core.arrays import Bytes
+from hypogoal.hypotheses import patches
+
+OF_IMAGES = "gru.weight_ih_l0"  # what nn.GRU, and files, call the weights that it multiplies images with
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Images as distinct pairs of a place and a patch: what a sum over places makes of an image is one over its pairs.
+
+    Attributes:
+        batch: the images' patches.
+        patch: int64 (P,), the patch of each of P pairs, in the order of their places.
+        counts: of each place, how many pairs have it.
+        among: float32 (N, P), 1 where one of N images has a pair.
+    """
+
+    batch: patches.PatchBatch
+    patch: Tensor
+    counts: list[int]
+    among: Tensor
+
+
+class PaperQNetwork(nn.Module):
+    """Two of (convolution, BatchNorm, ReLU, pooling), a GRU, two dense layers.
+
+    The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
+    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU stands behind pooling: the same function, cheaper.
+    """
+
+    HIDDEN = 512
+    CHANNELS = 32
+
+    def __init__(self, observation_shape: tuple[int, ...], actions: int):
+        super().__init__()
+        height, width, depth = observation_shape
+        self.features = nn.Sequential(
+            nn.Conv2d(depth, 16, 3),
+            nn.BatchNorm2d(16),
+            nn.MaxPool2d(2),
+            nn.ReLU(),
+            nn.Conv2d(16, self.CHANNELS, 3),
+            nn.BatchNorm2d(self.CHANNELS),
+            nn.MaxPool2d(2),
+            nn.ReLU(),
+        )
+        places = math.prod(((side - 2) // 2 - 2) // 2 for side in (height, width))
+        weights = dict(nn.GRU(self.CHANNELS * places, self.HIDDEN).named_parameters())
+        # Place by place: in nn.GRU's order every product with the weights of a place would copy them.
+        self.looks = nn.Parameter(by_place(weights.pop("weight_ih_l0").detach(), self.CHANNELS).contiguous())
+        self.gru = nn.ParameterDict(weights)
+        self.values = nn.Sequential(
+            nn.Linear(self.HIDDEN, 128),
+            nn.ReLU(),
+            nn.Linear(128, actions),
+        )
+        self.register_load_state_dict_pre_hook(_take_those_of_a_file)
+
+    def see(self, images: Tensor | Pieces) -> Tensor:
+        """uint8 (N, H, W, C), or their pieces -> what the GRU's gates take from each, float32 (N, 3 * ``HIDDEN``).
+
+        Nearly all of the arithmetic: so an image of many windows is looked at once, which ``nn.GRU`` cannot do.
+        """
+        bias = self.gru["bias_ih_l0"]
+        if isinstance(images, Pieces):
+            contents = patches.forward(self.features, images.batch).index_select(0, images.patch)
+            of_places = contents.split(images.counts)
+            products = [rows @ weight for rows, weight in zip(of_places, self.looks, strict=True)]
+            return torch.addmm(bias, images.among, torch.cat(products))
+        features = self.features(images.permute(0, 3, 1, 2).float() / 255.0)
+        placed = features.permute(0, 2, 3, 1).flatten(1)
+        return torch.addmm(bias, placed, self.looks.flatten(0, 1))
+
+    def pieces_of(self, images: Bytes) -> Pieces:
+        """Those of images uint8 (N, H, W, C) that repeat a few tiles: :meth:`see` computes each piece once."""
+        windows = patches.windows_of(self.features)
+        assert windows
+        batch = patches.take(patches.tables_of(images, windows), np.arange(len(images)))
+        places, distinct = batch.last.shape[1], len(batch.parts[-1])
+        pairs, ranks = torch.unique(batch.last + distinct * torch.arange(places), return_inverse=True)
+        counts = (pairs // distinct).bincount(minlength=places)
+        among = torch.zeros(len(images), len(pairs)).scatter_(1, ranks, 1.0)
+        return Pieces(batch, pairs % distinct, counts.tolist(), among)
+
+    def forward(
+        self,
+        seen: Tensor,
+        windows: Tensor,
+        lengths: Tensor,
+    ) -> Tensor:
+        """Values float32 (n, A) of the last states of windows.
+
+        ``windows`` int64 (n, T) say which of the images :meth:`see` saw each window has; of its T places the first
+        ``lengths`` (n,) are real.
+        """
+        state = seen.new_zeros(len(windows), self.HIDDEN)
+        for place, images in enumerate(windows.unbind(1)):
+            (real,) = (lengths > place).nonzero(as_tuple=True)
+            following = self._next(seen.index_select(0, images[real]), state.index_select(0, real))
+            state = state.index_copy(0, real, following)
+        return self.values(state)
+
+    def _next(self, seen: Tensor, state: Tensor) -> Tensor:
+        """The GRU's state (n, ``HIDDEN``) after one more image, by the equations of ``nn.GRU``."""
+        remembered = linear(state, self.gru["weight_hh_l0"], self.gru["bias_hh_l0"])
+        reset_of_image, update_of_image, new_of_image = seen.chunk(3, dim=1)
+        reset_of_state, update_of_state, new_of_state = remembered.chunk(3, dim=1)
+        reset = (reset_of_image + reset_of_state).sigmoid()
+        update = (update_of_image + update_of_state).sigmoid()
+        new = (new_of_image + reset * new_of_state).tanh()
+        return torch.lerp(new, state, update)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All weights, by the names and in the order of ``nn.GRU``, as files have them."""
+        tensors = self.state_dict()
+        looks = tensors.pop("looks")
+        return {**tensors, OF_IMAGES: looks.permute(2, 1, 0).flatten(1)}
+
+
+def by_place(weight: Tensor, channels: int) -> Tensor:
+    """Weights of ``nn.GRU``, (3 * hidden, channels * places) -> (places, channels, 3 * hidden)."""
+    return weight.unflatten(1, (channels, -1)).permute(2, 1, 0)
+
+
+def _take_those_of_a_file(network: PaperQNetwork, weights: MutableMapping[str, Any], *_of: object) -> None:
+    """Before weights are loaded: those in a file's order are put in the network's."""
+    if OF_IMAGES in weights:
+        weights["looks"] = by_place(weights.pop(OF_IMAGES), network.CHANNELS)
