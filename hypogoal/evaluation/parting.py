@@ -145,8 +145,8 @@ def members_of(numbers: pd.DataFrame) -> pd.DataFrame:
     wide = numbers.pivot_table("value", "member", ["scope", "quantity"])
     columns = {}
     for name, places in OF_MEMBERS.items():
-        own = [wide[place] for place in places if place in wide]
-        columns[name] = own[0] if own else np.nan
+        of_member = [wide[place] for place in places if place in wide]
+        columns[name] = of_member[0] if of_member else np.nan
     members = pd.DataFrame(columns, index=wide.index)
     features = {scope: wide[scope, "balanced_accuracy"] for scope in wide.columns.unique(0) if PLANTED in scope}
     if features:
