@@ -151,6 +151,13 @@ def test_the_picture_of_the_stages_is_drawn_from_their_code() -> None:
     assert picture["declared"](stage) == ("train-meta", ["ensemble", "options"], "meta")
 
 
+def test_pictures_of_a_report_are_of_this_version() -> None:
+    """``python docs/pictures.py RUN`` renews them and writes the version into them."""
+    pictures = runpy.run_path(str(DOCS / "pictures.py"))
+    for name in ("REPORT", "FILM"):
+        assert pictures["version_of"](pictures[name]) == hypogoal.__version__
+
+
 def test_editors_are_shown_the_signatures_of_the_code() -> None:
     """``python docs/signatures.py`` would change nothing; a name that Python gives is in the file, too."""
     signatures = runpy.run_path(str(DOCS / "signatures.py"))
