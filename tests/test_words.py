@@ -34,8 +34,6 @@ WORDS = {
     "Ensemble": r"ensembles?",
     "Execution": r"executions?",
     "False positive": r"false positives?",
-    "Fires far": r"fires far",
-    "Fires near": r"fires near",
     "Held-out states": r"held-out states",
     "Hypothesis": r"hypothes[ie]s",
     "Initiation set": r"initiation",
