@@ -168,7 +168,7 @@ def test_the_frozen_backbone_goes_through_all_stages(tmp_path: Path, monkeypatch
     told = [*facts["looked_at"]["sub_goals"].values()]
     assert told and all(goal["how"] == "integrated gradients" for goal in told)
     assert max(goal["completeness_error"] for goal in told) < 1e-3
-    assert "attributions by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
+    assert "against it, by integrated gradients" in (run / "report" / "index.html").read_text(encoding="utf-8")
     layers, (width,) = runpy.run_path(example.name)["vit"]((64, 64, 3))
     member = nn.Sequential(*layers, nn.Flatten(), nn.Linear(96, width), nn.ReLU(), nn.Linear(width, 2)).eval()
     weights = load_file(run / "ensemble" / "collect-red-key.safetensors")

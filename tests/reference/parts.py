@@ -38,7 +38,7 @@ CURVE_POINTS = 20  # that are kept of each curve
 NEWER = (  # quantities that release 0.23.0 did not have
     *("solved_1_10", "solved_11_20", "solved_21_50", "solved_51_100", "episodes_to_95", "solved_by_episode"),
 )
-NEWER_COLUMNS = ("better", "better_at_random", "episodes", "got_there")  # of the verdict's table
+NEWER_COLUMNS = ("better", "better_at_random", "episodes", "got_there", "trained")  # of the verdict's table
 CLOSE = 1e-4
 # Where pictures are trained on, forty steps part further on a processor that adds up otherwise: by 0.012 at most
 # between an AMD EPYC and an Intel Xeon. Another objective parts by 0.17 at least.
