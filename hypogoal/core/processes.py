@@ -1,6 +1,5 @@
 """Where work runs: in child processes, on a device, with one torch thread. Also how work is stopped."""
 
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -13,7 +12,7 @@ from contextlib import contextmanager, suppress
 from math import ceil, inf
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
@@ -25,7 +24,6 @@ DEVICES = ("auto", "cpu", "cuda")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and a cancelled job
 GROUPS = (Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"))  # on Linux, this process's control groups and their limits
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # parameters of the C library's mallopt
 
 _turn = threading.RLock()  # can be acquired again, because a stage may call another stage
 
@@ -176,7 +174,7 @@ def surroundings() -> Iterator[None]:
 
 
 def prepare(device: str = "auto") -> str:
-    """Set torch to one thread, no denormal numbers and kept memory. Return ``cpu`` or ``cuda`` (``auto`` is the CPU).
+    """Set torch to one thread, and without denormal numbers. Return ``cpu`` or ``cuda`` (``auto`` is the CPU).
 
     One thread per process is as fast on small networks and does not suffer from busy neighbours. It gives the same
     bytes again on the same machine, while other processors round differently. Denormal numbers are below 1e-38, which
@@ -190,23 +188,11 @@ def prepare(device: str = "auto") -> str:
         numpy.finfo(kind)  # before denormal numbers are off, because NumPy 2.3 and older warn if there are none
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    keep_freed(True)
     if device not in DEVICES:
         raise UserError("unknown device", device, f"Choose one of {', '.join(DEVICES)}.")
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("torch finds no GPU", f"torch {torch.__version__}", "Use --device cpu, or see docs/cluster.md.")
     return "cuda" if device == "cuda" else "cpu"
-
-
-def keep_freed(keep: bool) -> None:
-    """Say whether freed memory stays with this process for its next tensors. Works on Linux with GNU's C library.
-
-    If it does not stay, the memory of a large tensor goes back to the system, which clears all pages of the next one.
-    """
-    library: Any = ctypes.CDLL(None) if sys.platform == "linux" else None
-    if hasattr(library, "mallopt"):
-        library.mallopt(M_MMAP_MAX, 0 if keep else 65_536)
-        library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1 if keep else 131_072)
 
 
 @contextmanager
@@ -228,6 +214,5 @@ def own_settings() -> Iterator[None]:
         finally:
             torch.set_num_threads(threads)
             torch.set_flush_denormal(False)
-            keep_freed(False)
             torch.set_default_dtype(dtype)
             torch.set_default_device(device if device.type != "cpu" else None)

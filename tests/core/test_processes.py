@@ -3,7 +3,6 @@
 import math
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -12,12 +11,10 @@ from functools import partial
 from math import inf
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
 from hypogoal.command.call import outcome_of
-from hypogoal.core import processes, progress
+from hypogoal.core import progress
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import CORES, allowed, cores, in_processes, quota, stop
 from hypogoal.core.progress import MetricsLog, Progress
@@ -201,18 +198,3 @@ def test_a_reader_that_has_enough() -> None:
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, check=False)
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, b"")
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="is told to GNU's C library")
-def test_a_stage_takes_the_memory_of_freed_tensors_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next tensor is as large and gets no page from the system; after the stage memory is managed as before."""
-    managed, told = processes.keep_freed, []
-    monkeypatch.setattr(processes, "keep_freed", lambda keep: (told.append(keep), managed(keep)))
-    with processes.own_settings():
-        processes.prepare()
-        faults = [resource.getrusage(resource.RUSAGE_SELF).ru_minflt]
-        for _ in range(5):
-            torch.ones(2**24)  # 64 MiB, of 16,384 pages
-            faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
-        assert np.diff(faults).min() < 100
-    assert told == [True, False]
