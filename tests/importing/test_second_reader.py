@@ -170,19 +170,6 @@ def test_pictures_are_as_drawn_or_refused(draw_file: Callable[[Random], Drawn], 
     assert taken > count / 5
 
 
-FILMS = [
-    ("mp4", "mp4", "libx264", "yuv420p"),
-    ("mkv", "matroska", "libx264", "yuv444p"),
-    ("mov", "mov", "mpeg4", "yuv420p"),
-    ("avi", "avi", "mjpeg", "yuvj420p"),
-    ("webm", "webm", "libvpx-vp9", "yuv420p"),
-    ("mkv", "matroska", "ffv1", "yuv420p"),
-    ("avi", "avi", "mpeg4", "yuv420p"),
-    ("mkv", "matroska", "ffv1", "bgr0"),
-    ("mkv", "matroska", "ffv1", "bgra"),
-]
-
-
 @pytest.mark.parametrize("count", SOME)
 def test_arrays_are_as_written_or_refused(count: int) -> None:
     """Of every type of NumPy, in both orders of bytes and of axes, by one key or two, with labels of any kind."""
