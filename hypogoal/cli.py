@@ -47,15 +47,16 @@ class Commands(TyperGroup):
 
 app = typer.Typer(
     cls=Commands,
-    help="Transferable sub-goals by hypothesising which features generalise.\n\nStart here: "
-    "[bold]hypogoal run rooms --preset demo[/bold], two minutes from nothing to a report.",
-    epilog="Each command's --help ends with an example. Settings: hypogoal config STAGE.",
+    help="Learn sub-goals that hold in new places, by several hypotheses about what the labels mean.\n\nStart here: "
+    "[bold]hypogoal run rooms --preset demo[/bold] makes a report from nothing, in two minutes.",
+    epilog="Each command's --help ends with an example. 'hypogoal config STAGE' lists the settings of a command, "
+    "such as train-meta.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-Made = Annotated[Path, Argument(help="A data file, an artefact or a run.")]
-Json = Annotated[bool, Option("--json", metavar="", help="Machine-readable output.")]
+Made = Annotated[Path, Argument(help="A data file, an artefact (a folder that a command wrote), or a run.")]
+Json = Annotated[bool, Option("--json", metavar="", help="Print JSON for programs.")]
 
 
 def command(panel: str, example: str, name: str | None = None) -> Any:
@@ -78,7 +79,7 @@ def _root(
     ] = False,
     debug: Annotated[bool, Option("--debug", metavar="", help="Show the traceback of an error.")] = False,
     trust: Annotated[
-        bool, Option("--trust", metavar="", help="Allow code of your own that a file names (module:object).")
+        bool, Option("--trust", metavar="", help="Run code of your own if a file names it (as module:object).")
     ] = False,
 ) -> None:
     """Options before a command; ``main`` takes them anywhere."""
@@ -165,10 +166,10 @@ def echo(value: Any, as_json: bool, text: Iterable[str]) -> None:
 @command(MAKE, "run doorkey --preset demo --out runs/demo")
 def run(
     experiment: Annotated[str, Argument(help=EXPERIMENTS)],
-    out: Annotated[Path | None, Option(help="What to write. Default: runs/EXPERIMENT.")] = None,
+    out: Annotated[Path | None, Option(help="The folder to write. Default: runs/EXPERIMENT.")] = None,
     preset: call.Preset = None,
     set_: stage.Set = None,
-    seed: Annotated[str | None, Option(help="Seeds to run, instead of the experiment's: 3, or 0-9.")] = None,
+    seed: Annotated[str | None, Option(help="Seeds to run instead of the experiment's, such as 3 or 0-9.")] = None,
     device: call.Device = "auto",
     force: call.Force = False,
     resume: call.Resume = False,
@@ -177,15 +178,17 @@ def run(
     ] = None,
     only: Annotated[str | None, Option(metavar="STAGE", help="Run this stage again and no other stage.")] = None,
     engine: Annotated[
-        Literal["local", "slurm"], Option(help="The cores of this machine, or job arrays of a cluster.")
+        Literal["local", "slurm"],
+        Option(help="Where to run: on the cores of this machine, or in job arrays of a cluster."),
     ] = "local",
-    sbatch: Annotated[str, Option(help="Options for sbatch, as typed: '--time=4:00:00 --mem=8G'.")] = "",
+    sbatch: Annotated[str, Option(help="Options for sbatch as you type them, such as '--time=4:00:00 --mem=8G'.")] = "",
     quiet: call.Quiet = False,
-    dry_run: Annotated[bool, Option("--dry-run", metavar="", help="List the commands; run none.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", metavar="", help="List the commands and run none of them.")] = False,
 ) -> None:
     """Run every command of an experiment, from nothing to a report.
 
-    --set takes settings of the experiment, and STAGE.KEY=VALUE.
+    --set KEY=VALUE changes a setting of the experiment, and
+    --set STAGE.KEY=VALUE one of a command in it, such as train-meta.
     """
     from hypogoal import look
     from hypogoal.experiments import plan as plans
@@ -199,6 +202,8 @@ def run(
         return
     if engine == "local" and device == "cuda":  # with Slurm another machine's device is meant
         processes.prepare(device)
+    if engine == "local" and not quiet:
+        say(f"Each line names what one command makes in {out}.", err=True)
     runs.run(
         cells,
         out,
@@ -223,7 +228,7 @@ def show(
     as_json: Json = False,
     pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
 ) -> None:
-    """Describe a file or folder: kind, result, settings, inputs."""
+    """Say what a file or folder is, what came out, and how it was made."""
     from hypogoal import look
 
     details = look.describe(path)
@@ -236,9 +241,10 @@ def show(
 
 @command(stage.LOOK, "verify runs/mine")
 def verify(path: Made, as_json: Json = False) -> None:
-    """Check for missing or changed files; exit code 2 if there are any.
+    """Check for missing or changed files. The exit code is 2 if there are any.
 
-    Reads every file, and those inputs that lie within PATH. What is still being made is named, not checked.
+    It reads every file, and the inputs that lie within PATH. It names outputs that are
+    still being made, and does not check them.
     """
     from hypogoal import look
 
@@ -265,13 +271,15 @@ def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False
 
 @command(stage.LOOK, "config train-ensemble --domain montezuma")
 def config(
-    stage: Annotated[str, Argument(help="For example train-meta, or run.")],
-    domain: Annotated[str, Option(help=f"Settings for: {call.DOMAINS}")] = "doorkey",
+    stage: Annotated[str, Argument(help="A command that has settings, such as train-meta or run.")],
+    domain: Annotated[str, Option(help=f"The domain whose defaults to show: {call.DOMAINS}")] = "doorkey",
     preset: call.Preset = None,
-    toml: Annotated[bool, Option("--toml", metavar="", help="Print a .toml file to edit, for --preset.")] = False,
+    toml: Annotated[
+        bool, Option("--toml", metavar="", help="Print a .toml file, which you can edit and give to --preset.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """List every setting of a stage: default, unit, meaning, source."""
+    """List every setting of a stage, with default, unit, meaning and source."""
     from hypogoal.core import config as settings
     from hypogoal.domains import base as domains
     from hypogoal.experiments.experiment import config_class_of
@@ -313,7 +321,7 @@ def check(
     set_: stage.Set = None,
     seed: call.Seed = 0,
 ) -> None:
-    """Check that your domain or part of an agent keeps its contract, or that data suffice.
+    """Check that your domain or your part of an agent works, or that your data suffice.
 
     Of a data file it says in a minute whether there are enough labels, whether
     they leave more than one hypothesis, and how long training will take. There

@@ -86,7 +86,7 @@ class BaselineConfig(WorldConfig):
         choices=("ppo", "dqn"),
     )
     steps: int = setting(
-        300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
+        300_000, "number of environment steps, summed over all environments", unit="steps", source="paper: 1.5e6", low=1
     )
     environments: int = setting(
         0,

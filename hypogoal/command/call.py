@@ -16,20 +16,22 @@ if TYPE_CHECKING:
     from hypogoal.core.config import C
 
 Place = str | os.PathLike[str]
-DOMAINS = "doorkey, montezuma, rooms, or module:object."
+DOMAINS = "doorkey, montezuma, rooms, or your own as module:object."
 # Options that stages leave out which do not train, or have no settings.
 NO_TRAINING = ("device", "tensorboard")
 NO_SETTINGS = ("preset", "seed", *NO_TRAINING)
 
-Out = Annotated[Path, Option("--out", help="What to write; it must not exist yet.")]
-Preset = Annotated[str | None, Option("--preset", help="demo, paper, or your .toml file.")]
-Seed = Annotated[int, Option("--seed", min=0, help="Seed of all randomness.")]
-Device = Annotated[str, Option("--device", help="Where to train: auto (the CPU), cpu or cuda.")]
+Out = Annotated[Path, Option("--out", help="The file or folder to write, which must not exist yet.")]
+Preset = Annotated[
+    str | None, Option("--preset", help="A set of settings: demo (quick), paper (the paper's), or your .toml file.")
+]
+Seed = Annotated[int, Option("--seed", min=0, help="The number from which all random numbers are drawn.")]
+Device = Annotated[str, Option("--device", help="Where to train: cpu, cuda, or auto, which means the CPU.")]
 Force = Annotated[bool, Option("--force", metavar="", help="Replace what is at --out.")]
-RESUME = "Continue an unfinished output; keep a complete one."
+RESUME = "Continue an unfinished output, and keep a complete one."
 Resume = Annotated[bool, Option("--resume", metavar="", help=RESUME)]
 Quiet = Annotated[bool, Option("--quiet", "-q", metavar="", help="Show no progress.")]
-BOARD = "Also write the log for TensorBoard into this folder (pip install 'hypogoal\\[tensorboard]')."
+BOARD = "Also write the log for TensorBoard into this folder; this needs pip install 'hypogoal\\[tensorboard]'."
 Tensorboard = Annotated[Path | None, Option("--tensorboard", metavar="DIR", help=BOARD)]
 
 

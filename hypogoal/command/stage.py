@@ -29,19 +29,19 @@ if TYPE_CHECKING:
 LISTED = {  # every stage and tool in a line, after those whose outputs it reads; it is loaded when it is called
     "collect": "Collect labelled, unlabelled and held-out states.",
     "import": "Make a data file of your arrays, pictures or recorded episodes.",
-    "train-ensemble": "Train diverse classifiers (members) of each sub-goal.",
+    "train-ensemble": "Train diverse classifiers (members) for each sub-goal.",
     "train-options": "Learn an option (a policy) for every member.",
     "train-meta": "Learn from the reward which options to choose.",
-    "train-baseline": "Train PPO or DQN on primitive actions, to compare.",
-    "evaluate": "Compute every number of a run: accuracy, curves, choices.",
-    "report": "Draw the report of an evaluated run: one HTML file.",
-    "compare": "Put evaluated runs side by side: what differs, who wins.",
+    "train-baseline": "Train PPO or DQN without options, to compare.",
+    "evaluate": "Compute every number of a run, such as accuracies and choices.",
+    "report": "Draw the report of an evaluated run as one HTML file.",
+    "compare": "Put evaluated runs side by side, and say which one wins.",
     "export": "Write an agent's episodes or an ensemble for other software.",
-    "audit": "How often, and where, do policies fool a success classifier?",
+    "audit": "Say how often, and where, policies fool a success classifier.",
 }
 LOOK, OWN = "Look", "Own data and code"  # groups of commands
 TOOLS = {"compare": LOOK, "import": OWN, "export": OWN, "audit": OWN}
-SET = "Change a setting; see 'hypogoal config'. Repeatable."
+SET = "Change a setting; 'hypogoal config STAGE' lists all. May be repeated."
 Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET)]
 
 
@@ -77,7 +77,7 @@ class Stage:
         options = [option for option in shared if option.name not in self.leaves_out]
         self.options = [*self.inputs, *options]
         if self.into:
-            by_default = Option("--out", help=f"Default: {self.source.name.upper()}/{self.into}.")
+            by_default = Option("--out", help=f"The folder to write. Default: {self.source.name.upper()}/{self.into}.")
             self.out = self.out.replace(default=None, annotation=Annotated[Path | None, by_default])
 
     def python(self) -> Callable[..., "Made"]:
@@ -150,7 +150,7 @@ class Stage:
             return
         yield Parameter("set_", Parameter.KEYWORD_ONLY, default=None, annotation=Set)
         rows = {row["name"]: row for row in described(model_of(self.name))} if self.often else {}
-        panel = f"Settings, with doorkey's defaults (all: hypogoal config {self.name})"
+        panel = f"Settings and usual defaults (your domain's: hypogoal config {self.name})"
         for name in self.often:
             row = rows[name]
             meaning = row["meaning"][0].upper() + row["meaning"][1:]

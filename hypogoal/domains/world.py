@@ -17,7 +17,7 @@ RANDOM_EPISODES = 200  # of random play, which say how hard a layout is
 class WorldConfig(Config):
     """The world that an agent plays in."""
 
-    layout_seed: int = setting(100, "the layout the agent lives on", source="paper, Figure 6", low=0)
+    layout_seed: int = setting(100, "seed of the layout on which the agent lives", source="paper, Figure 6", low=0)
     start: str = setting(
         "",
         "where episodes begin, in a domain that names several places",

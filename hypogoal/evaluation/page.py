@@ -143,13 +143,16 @@ def sparse(rows: Any, labels: int) -> list[list[str]]:
     return table.to_numpy().tolist()
 
 
-def terminal(title: str, frame: DataFrame) -> Table:
-    """A displayed table for a terminal, 80 columns wide: of its first columns as many as fit, means alone."""
+def terminal(title: str, frame: DataFrame, note: str | None = None) -> Table:
+    """A displayed table for a terminal, 80 columns wide: of its first columns as many as fit, means alone.
+
+    ``note``: what stands below it.
+    """
     frame = frame.map(lambda text: re.split(r" ±| \[", text)[0])
     labels = min(40, max(len(" | ".join(map(str, np.atleast_1d(key)))) for key in frame.index))
     wide = [3 + max(len(str(name)), *map(len, frame[name])) for name in frame]
     frame = frame.loc[:, labels + 4 + np.cumsum(wide) <= WIDTH]  # with the borders of the labels
-    printed = Table(title=title, title_justify="left", width=WIDTH)
+    printed = Table(title=title, title_justify="left", caption=note, caption_justify="left", width=WIDTH)
     for name in frame.index.names:
         printed.add_column(str(name), overflow="fold")
     for name in frame.columns:

@@ -7,7 +7,7 @@ needs, nothing where the run has nothing of it. These names are known here:
 - ``compared``: those of each run's numbers whose pairs, ``pairs``, its table of pairs has.
 - ``figures``: :class:`page.Drawn` ones, of which its template's macro ``caption`` says what they show.
 
-Its template sets ``shown``, what a terminal prints, unless it is folded.
+Its template sets ``shown``, what a terminal prints, unless it is folded, and may set ``note``, the words below that.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -149,13 +149,14 @@ def write(folder: Path, results: run.Results, every: list[Context]) -> list[str]
 def summary(results: run.Results, every: list[Context]) -> list[str]:
     """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
     domains = ", ".join(provenance.domains_of(results))
-    tables = []
+    tables: list[Table | str] = []
     for context in every:
         if context["folded"]:
             continue
-        shown = page.words_of(context).shown
-        if not shown.empty:  # such as the layouts of a run without agents
-            tables.append(page.terminal(f"{context['title']}: {domains}", shown))
+        words = page.words_of(context)
+        if not words.shown.empty:  # such as the layouts of a run without agents
+            note = getattr(words, "note", None)
+            tables += [page.terminal(f"{context['title']}: {domains}", words.shown, note), ""]
     lines = Table.grid()
     lines.width = page.WIDTH
     if results.facts["missing"]:

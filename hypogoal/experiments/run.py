@@ -156,7 +156,7 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                 ready = [cell for cell in makeable if at_work.isdisjoint(cell.after)]
                 for cell in ready[:free]:
                     todo.remove(cell)
-                    say(f"{cell.name} ...; {_to_come(cells, len(todo), time.monotonic() - begun_at)}")
+                    say(f"{cell.name} begins; {_to_come(cells, len(todo), time.monotonic() - begun_at)}")
                     # A fork has the environment of the process that it is forked from.
                     variables = {**os.environ, CORES: str(max(1, free // len(ready)))}
                     words = [*cell.command, "--resume"]
@@ -169,7 +169,7 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                     if cell.state == RUNNING:  # by a process that is left over
                         todo.append(cell)
                     elif cell.state == DONE:
-                        say(f"{cell.name} done")
+                        say(f"{cell.name} is done")
                     elif -process.exitcode in CRASHED and crashes[cell.name] < CRASHES:
                         crashes[cell.name] += 1
                         todo.append(cell)
@@ -186,8 +186,8 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
 def _to_come(cells: Sequence[Cell], waiting: int, seconds: float) -> str:
     """How many cells wait, and how long all that is left takes at the pace of what is done after so many seconds."""
     done = sum(cell.is_done for cell in cells)
-    left = f", some {duration(seconds / done * (len(cells) - done))} left" if done else ""
-    return f"{waiting} to come{left}"
+    left = f", about {duration(seconds / done * (len(cells) - done))} left" if done else ""
+    return f"{waiting} {'command' if waiting == 1 else 'commands'} to come{left}"
 
 
 def _make(words: list[str], log: Path, variables: Mapping[str, str]) -> None:

@@ -25,7 +25,9 @@ class MembersConfig(Config):
         high=64,
     )
     diversity: str = setting(
-        "dbat", "diversity objective: dbat, none, another of docs/concepts.md, or module:function", source="Eq. (1)"
+        "dbat",
+        "diversity objective: dbat, none, another one of docs/concepts.md, or your own as module:function",
+        source="Eq. (1)",
     )
     teacher: str = setting(
         "",
@@ -35,14 +37,14 @@ class MembersConfig(Config):
     )
     network: str = setting(
         "auto",
-        "network of each member: doorkey, montezuma, tiles, mlp, or module:function; auto: the first of doorkey, "
-        "montezuma and tiles that takes pictures of this size, otherwise mlp; for observations by key, a network for "
-        "each key: front=tiles,state=mlp",
+        "network of each member: doorkey, montezuma, tiles, mlp, or your own as module:function; auto takes the first "
+        "of doorkey, montezuma and tiles that fits pictures of this size, otherwise mlp; if observations have several "
+        "keys, give one for each key, such as front=tiles,state=mlp",
         source="the paper's appendix",
     )
     steps: int = setting(
         150,
-        "gradient steps of a training, for each member if the schedule is sequential",
+        "number of gradient steps of a training, or of each member's training if the schedule is sequential",
         unit="batches",
         source="own choice, the paper has none: docs/results/hypotheses.md",
         low=1,
@@ -113,9 +115,9 @@ class TrainEnsembleConfig(MembersConfig):
 
     diversity_weight: float | Literal["auto"] = setting(
         AUTO,
-        "weight of the diversity loss (alpha); auto: the largest of 1, 0.3, 0.1, ... at which every member is as right "
-        "about held-out labels as members trained without diversity, within a standard error, and members differ on at "
-        "most half of the unlabelled states",
+        "weight of the diversity loss (alpha): a number; or auto, which chooses the largest of 1, 0.3, 0.1, ... at "
+        "which every member is as right about labels set aside as members trained without diversity, within a standard "
+        "error, and members differ on at most half of the unlabelled states",
         source=f"{BEYOND}: docs/concepts.md",
         low=0.0,
         words=[AUTO],

@@ -73,7 +73,7 @@ class PlayConfig(OptionConfig, WorldConfig):
 
     gamma: ClassVar[float] = 1.0  # discount per environment step of the rewards inside an option
 
-    steps: int = setting(1, "environment steps, all environments together", unit="steps", low=1)
+    steps: int = setting(1, "number of environment steps, summed over all environments", unit="steps", low=1)
     chooser: str = setting("random", "the chooser, which decides what option runs next", own=True)
     layouts: str = setting(
         "",
@@ -111,15 +111,15 @@ class PracticeConfig(PlayConfig):
 
     steps: int = setting(
         60_000,
-        "environment steps, all environments together; if options are restarted, environment steps for each option",
+        "number of environment steps, summed over all environments; with restart_options, the number for each option",
         unit="steps",
         source="paper: 3e5 for each option",
         low=1,
     )
     chooser: str = setting(
         "random",
-        "the chooser, which decides what option runs next: random, uniform among the options offered; even, the option "
-        "with the fewest steps so far",
+        "the chooser, which decides what option runs next: random, any option offered, with equal probability; even, "
+        "the option with the fewest steps so far",
         source="paper, policy learning",
         choices=("random", "even"),
         own=True,
@@ -145,12 +145,12 @@ class TrainMetaConfig(PlayConfig):
     gamma: ClassVar[float] = GAMMA
 
     steps: int = setting(
-        300_000, "environment steps, all environments together", unit="steps", source="paper: 1.5e6", low=1
+        300_000, "number of environment steps, summed over all environments", unit="steps", source="paper: 1.5e6", low=1
     )
     chooser: str = setting(
         "symbols",
-        "the chooser, which decides what option runs next: symbols, a table that counts; ppo, a network; random, "
-        "uniform among the options offered",
+        "the chooser, which decides what option runs next: symbols, which counts what followed; ppo, a network; "
+        "random, any option offered, with equal probability",
         source="ours (DEV-54); paper: ppo",
         choices=("symbols", "ppo", "random"),
         own=True,
@@ -165,14 +165,14 @@ class AuditConfig(PracticeConfig):
 
     option_timeout: int = setting(
         50,
-        "an execution, which is one run of a policy, ends after this many steps at the latest",
+        "one run of a policy, called an execution, ends after this many steps at the latest",
         unit="steps",
         low=1,
         high=32_000,
     )
     restart_options: bool = setting(True, "every execution begins a new episode, at a start state")
     mask_reached: bool = setting(False, "do not begin executions where the prediction is already positive")
-    steps: int = setting(80_000, "environment steps, all policies together", unit="steps", low=1)
+    steps: int = setting(80_000, "number of environment steps, summed over all policies", unit="steps", low=1)
     chooser: str = setting(
         "even",
         "which policy plays next: even, the policy with the fewest steps so far; random, any policy",
@@ -188,7 +188,7 @@ class AuditConfig(PracticeConfig):
     )
     mend: float = setting(
         0.95,
-        "a second policy learns to fool the classifier at this higher threshold; 0: no second policy",
+        "higher threshold at which a second policy learns to fool the classifier; 0 means no second policy",
         low=0.0,
         high=1.0,
     )

@@ -93,16 +93,16 @@ class OptionConfig(Config):
 
     network: str = setting(
         "light",
-        "how options act: light, by a small Q-network on cells; paper, by a conv-GRU; planned, by the shortest path, "
-        "if the domain knows what each action leads to",
+        "how options act: light, by a small Q-network; paper, by the paper's larger one, a conv-GRU; planned, by the "
+        "shortest path, if the domain knows what each action leads to",
         source="paper, appendix; the others: ours",
         choices=("light", "paper", "planned"),
         own=True,
     )
     termination: str = setting(
         "learned",
-        "where options end: learned, at the first positive prediction; oracle, where the sub-goal is true, which is an "
-        "upper bound; or by a rule of your own",
+        "where options end: learned, where their member first says yes; oracle, where the sub-goal truly holds, which "
+        "shows what right members could do; or by a rule of your own",
         source="paper: learned",
         choices=("learned", "oracle"),
         own=True,

@@ -11,7 +11,7 @@ from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.progress import Progress
 
-PLAYED = "Layouts that agents, and each option alone, also play without learning: 2000-2099 or 7,9."
+PLAYED = "Other layouts, such as 2000-2099 or 7,9, on which agents and single options are to play, without learning."
 
 
 @stage(
@@ -26,7 +26,7 @@ def evaluate(
     *,
     layouts: Annotated[str | None, Option(help=PLAYED)] = None,
 ) -> Done:
-    """Compute every number of a run: accuracy, curves, choices.
+    """Compute every number of a run, such as accuracies and choices.
 
     ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them. ``out`` gets ``numbers.csv``,
     each question's ``tables/*.csv``, ``run.json`` (what is missing, provenance), ``arrays.h5`` and, of a run of an

@@ -12,7 +12,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
 
 MOST_BYTES = 2_000_000  # of a film on the page
-FILMS = "Films of the policy over options, in the report's videos/*.gif; the page shows one. Default: one, if possible."
+FILMS = "How many films of the agent to write as videos/*.gif; the page shows one of them. Default: one, if possible."
 
 
 @stage("report runs/mine --videos 3", leaves_out=NO_SETTINGS, into="report")
@@ -20,11 +20,11 @@ def report(
     call: Call,
     run: Annotated[Path, Argument(help="An evaluated run.")],
     *,
-    figures: Annotated[Path | None, Option(help="Draw the paper's figures into this folder, not the page.")] = None,
-    format: Annotated[str, Option(help="For --figures: svg, pdf or png.")] = "svg",
+    figures: Annotated[Path | None, Option(help="Draw only the paper's figures, into this folder.")] = None,
+    format: Annotated[str, Option(help="The format of --figures: svg, pdf or png.")] = "svg",
     videos: Annotated[int | None, Option(min=0, help=FILMS)] = None,
 ) -> Done:
-    """Draw the report of an evaluated run: one HTML file.
+    """Draw the report of an evaluated run as one HTML file.
 
     ``out`` gets the page ``index.html``, ``figures/*.svg`` and, of so many ``videos``, which the first agent of the run
     plays, ``videos/*.gif``. With ``figures``, a folder, only the paper's figures are drawn.

@@ -22,7 +22,7 @@ def train_baseline(
     *,
     data: Annotated[Path | None, Option(help="Play in the world where these states were collected.")] = None,
 ) -> Done:
-    """Train PPO or DQN on primitive actions, to compare.
+    """Train PPO or DQN without options, to compare.
 
     Without ``data`` it plays in the world of the domain's defaults.
     """

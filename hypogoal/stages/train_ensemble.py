@@ -19,8 +19,11 @@ TITLES = {
     "mean": "mean",
     "worst": "worst",
 }
-IDLE = "Give unlabelled states in which features part, or fewer members."
-ELSEWHERE = "Where unlabelled states come from instead: data, or an agent or options with save_visited. Repeatable."
+IDLE = "Give unlabelled states in which one rule is true and another one false, or fewer members."
+ELSEWHERE = (
+    "Take the unlabelled states from this data file, or from an agent or options that were trained with the setting "
+    "save_visited. May be repeated."
+)
 
 
 @stage(
@@ -30,11 +33,11 @@ ELSEWHERE = "Where unlabelled states come from instead: data, or an agent or opt
 )
 def train_ensemble(
     call: Call,
-    data: Annotated[Path, Argument(help="The HDF5 file that 'collect' wrote.")],
+    data: Annotated[Path, Argument(help="The data file (HDF5) that 'collect' or 'import' wrote.")],
     *,
     unlabelled: Annotated[list[Path] | None, Option(help=ELSEWHERE)] = None,
 ) -> Done:
-    """Train diverse classifiers (members) of each sub-goal.
+    """Train diverse classifiers (members) for each sub-goal.
 
     ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
     of those of ``data``. Each sub-goal has a progress line and a folder of TensorBoard's of its own.

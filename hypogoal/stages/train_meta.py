@@ -29,8 +29,12 @@ def train_meta(
     call: Call,
     ensemble: Annotated[Path, Argument(help="The folder that 'train-ensemble' wrote.")],
     *,
-    options: Annotated[Path | None, Option(help="Continue the options of 'train-options'.")] = None,
-    agent: Annotated[Path | None, Option(help="Continue choosing as this agent learned to, elsewhere.")] = None,
+    options: Annotated[
+        Path | None, Option(help="Go on with the options in this folder, which 'train-options' wrote.")
+    ] = None,
+    agent: Annotated[
+        Path | None, Option(help="Begin with what the agent in this folder learned about choosing.")
+    ] = None,
 ) -> Done:
     """Learn from the reward which options to choose.
 

@@ -21,7 +21,9 @@ def train_options(
     call: Call,
     ensemble: Annotated[Path, Argument(help="The folder that 'train-ensemble' wrote.")],
     *,
-    options: Annotated[Path | None, Option(help="Continue these options, perhaps elsewhere.")] = None,
+    options: Annotated[
+        Path | None, Option(help="Go on training the options in this folder, here or on another layout.")
+    ] = None,
 ) -> Done:
     """Learn an option (a policy) for every member.
 

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from hypogoal.meta.config import AuditConfig
 
 REPORT = "audit.json"
-WHERE = "Where to play; without it, look at recorded data."
-WHICH = "The labelled data to look at. Default: what the members were trained with."
+WHERE = "The domain in which policies play. Without it the audit looks at recorded data."
+WHICH = "The labelled data to look at. Default: those with which the members were trained."
 TRUTH = "The sub-goal that the classifier is meant to recognise."
-LIMIT = "Exit with code 3 if false positives are more than this share of executions, or of states met or recorded."
+LIMIT = "Exit with code 3 if more than this share of the executions, or of the states seen, are false positives."
 FAILED = 3
 
 
@@ -34,11 +34,11 @@ def audit(
     domain: Annotated[str | None, Option(help=WHERE)] = None,
     data: Annotated[Path | None, Option(help=WHICH)] = None,
     sub_goal: Annotated[str | None, Option(help=TRUTH)] = None,
-    member: Annotated[int | None, Option(min=0, help="Which member of the ensemble. Default: 0.")] = None,
+    member: Annotated[int | None, Option(min=0, help="The number of the member to audit. Default: 0.")] = None,
     fail_above: Annotated[float | None, Option(metavar="SHARE", min=0, max=1, help=LIMIT)] = None,
     as_json: Annotated[bool, Option("--json", metavar="", help="Print one line of JSON.")] = False,
 ) -> Done:
-    """How often, and where, do policies fool a success classifier?
+    """Say how often, and where, policies fool a success classifier.
 
     A policy is trained against it, and beside it one against the mended one. The classifier is a ``member`` of an
     ensemble artefact, or ``module:function`` from observations (N, *obs) to probabilities (N,). The truth is that of

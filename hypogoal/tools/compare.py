@@ -17,9 +17,11 @@ from hypogoal.core.errors import UserError
 )
 def compare(
     call: Call,
-    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Evaluated; each is compared with the first.")],
+    runs: Annotated[
+        list[Path], Argument(metavar="RUN...", help="Evaluated runs; each is compared with the first one.")
+    ],
 ) -> Done:
-    """Put evaluated runs side by side: what differs, who wins.
+    """Put evaluated runs side by side, and say which one wins.
 
     Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
     """

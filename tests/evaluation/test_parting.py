@@ -78,9 +78,12 @@ def test_each_way_to_disagree_comes_before_any_comes_again() -> None:
 @pytest.mark.parametrize(
     ("chosen", "said"),
     [
-        ([90, 10], "<b>The agent runs/b went by member 0.</b> Of the 100 options"),
-        ([55, 45], "<b>The agent runs/b went by no single member.</b>"),
-        ([3, 1], "took 4 options for this sub-goal in training. These are too few"),
+        (
+            [90, 10],
+            "<b>The agent in runs/b preferred member 0.</b> In training it ran an option for this sub-goal 100 times",
+        ),
+        ([55, 45], "<b>The agent in runs/b preferred no single member.</b>"),
+        ([3, 1], "ran an option for this sub-goal 4 times in training, which is too seldom"),
     ],
 )
 def test_the_page_says_which_member_the_agent_went_by(chosen: list[int], said: str) -> None:

@@ -71,18 +71,19 @@ def test_seeds_are_the_units_of_a_single_layout() -> None:
     sentence, warning = sentences(run_of({SEVERAL: [0.0]}, played, layouts=False))
     assert sentence == (
         "Choosing mattered on these 3 seeds: the agent solves 97 % of the episodes, but uniform-random choice among "
-        "its own options solves 45 %. The difference is +50 points in the median of the seeds, and from 50 to 55 over "
-        "all of them."
+        "its own options solves 45 %. The median difference over the seeds is +50 percentage points, and single "
+        "differences go from 50 to 55. So choosing at random would not have been enough."
     )
-    assert warning == "Fewer than six layouts or seeds are not evidence, so train more."
+    assert warning == "Fewer than six layouts or seeds are not evidence, so repeat the run with more."
     several = {SEVERAL: [1.0] * 6, UNIFORM: [0.5, 0.4, 0.45] * 2}
     (sentence,) = sentences(run_of({SEVERAL: [0.0]}, several, layouts=False))
     assert sentence.startswith("Choosing mattered on 6 seeds:") and sentence.endswith(
-        "+55 points in the median of the seeds, with a 95 % interval from 50 to 60."
+        "The median difference over the seeds is +55 percentage points, with a 95 % interval from 50 to 60. So "
+        "choosing at random would not have been enough."
     )
     one = sentences(run_of({SEVERAL: [0.0]}, {SEVERAL: [1.0], UNIFORM: [0.5]}))
     assert one[0].startswith("Choosing mattered on this layout:") and "points" not in one[0]
-    assert one[1] == "One run is not evidence, so train more layouts or seeds."
+    assert one[1] == "One run is not evidence, so repeat it on more layouts or with more seeds."
 
 
 def test_the_verdict_says_after_how_many_episodes() -> None:
@@ -95,8 +96,8 @@ def test_the_verdict_says_after_how_many_episodes() -> None:
         rows += [row("success", 0.2, method=UNIFORM, scope=FROZEN, **place)]
         rows += [] if episodes is None else [row("episodes_to_95", episodes, method=SEVERAL, **place)]
     _, told, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
-    assert told.startswith("The reward told the agent what to do within 40 episodes in the median")
-    assert told.endswith("That happened in 75 % of its runs.")
+    assert told.startswith("The reward told the agent what to do within 40 episodes, the median of its runs,")
+    assert "It came so far in 75 % of its runs. So expect" in told
 
 
 def test_the_verdict_says_that_the_reward_has_not_told() -> None:
@@ -110,7 +111,7 @@ def test_the_verdict_says_that_the_reward_has_not_told() -> None:
 
 @pytest.mark.parametrize(
     ("better", "said"),
-    [(0.55, "So it chose between sub-goals, not between hypotheses."), (0.9, "So it chose between hypotheses, too.")],
+    [(0.55, "it chose between sub-goals, not between hypotheses."), (0.9, "because it chose between hypotheses.")],
 )
 def test_choosing_sub_goals_is_told_from_choosing_among_members(better: float, said: str) -> None:
     """By how often the better of two members is taken, against uniform-random choice among the same options."""
@@ -119,7 +120,7 @@ def test_choosing_sub_goals_is_told_from_choosing_among_members(better: float, s
         place = {"method": method, "scope": FROZEN, "layout": 7, "seed": 0, "artefact": "own"}
         rows += [row("success", solved, **place), row("pair", share, **place)]
     first, second, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
-    shares = f"takes the better one in {better:.0%} of the cases, and uniform-random choice does in 48%".replace(
+    shares = f"takes the better one in {better:.0%} of the cases, and uniform-random choice takes it in 48%".replace(
         "%", " %"
     )
     assert first.startswith("Choosing mattered on this layout: the agent solves 100 %") and second.endswith(said)
@@ -185,8 +186,10 @@ def test_options_on_ladders_are_compared_by_the_member_that_validation_picks() -
     rows = [each for seed in range(3) for each in ladder("D-BAT, 2 members", seed, 0.0, 0.9, validated=1)]
     rows += [each for seed in range(3) for each in ladder(ONE, seed, 0.1, validated=None)]
     sentence, _ = sentences(results_of(*rows))
-    assert sentence.startswith("Having several hypotheses mattered on these 3 seeds: options of D-BAT, 2 members stop")
-    assert "in 90 % of the executions, but those of one classifier do in 10 %" in sentence
+    assert sentence.startswith(
+        'Having several hypotheses mattered on these 3 seeds: options of the ensemble "D-BAT, 2 '
+    )
+    assert "in 90 % of their executions, and options of one classifier in 10 %" in sentence
     (alone,) = sentences(results_of(*ladder("D-BAT, 2 members", 0, 0.25)))
     assert "unknown, because the run has no options of one classifier" in alone
 

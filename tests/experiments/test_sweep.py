@@ -79,9 +79,11 @@ def test_forked_and_fresh_cells_make_the_same_bytes(whole: Path, tmp_path: Path)
     begin(chain, tmp_path / "fresh")
     said: list[str] = []
     run_local(chain, workers=2, say=said.append, forked=False)
-    starts = [line for line in said if " ...; " in line]
+    starts = [line for line in said if " begins; " in line]
     assert [line.split()[0] for line in starts] == [cell.name for cell in chain]
-    assert starts[0].endswith("; 2 to come") and re.search(r"; 1 to come, some 00:\d\d left$", starts[1])
+    assert starts[0].endswith("; 2 commands to come") and re.search(
+        r"; 1 command to come, about 00:\d\d left$", starts[1]
+    )
     assert all(map(find_spec, PRELOADED))
     fresh, forked = bytes_of(tmp_path / "fresh"), bytes_of(whole / "out")
     assert fresh == {name: forked[name] for name in fresh} and len(fresh) > 8
@@ -116,7 +118,9 @@ def test_what_shares_its_work_among_the_cores_has_them_first(tmp_path: Path) -> 
     said: list[str] = []
     begin([data, other, wide], tmp_path)
     run_local([data, other, wide], workers=3, say=said.append)
-    assert said.index("wide done") < next(place for place, line in enumerate(said) if line.startswith("other ..."))
+    assert said.index("wide is done") < next(
+        place for place, line in enumerate(said) if line.startswith("other begins")
+    )
     other.out.unlink()
     wide.out.unlink()
     run_local([other], workers=3, say=said.append)
@@ -142,7 +146,7 @@ def test_a_cell_that_crashes_goes_on(whole: Path, tmp_path: Path, monkeypatch: p
     assert child.pid is not None
     os.kill(child.pid, signal.SIGSEGV)
     running.join()
-    assert said[-2].startswith("ensemble/seed-0 ...; 0 to come") and said[-1] == "ensemble/seed-0 done"
+    assert said[-2].startswith("ensemble/seed-0 begins; 0 commands to come") and said[-1] == "ensemble/seed-0 is done"
     assert any(re.match(r"ensemble/seed-0 crashed \(signal (6|11)\): it goes on", line) for line in said)
     unbroken = tmp_path / "unbroken"
     run("train-ensemble", out / "data.h5", "--out", unbroken, "-q", *SMALL.replace("20", "80").split(), "--seed", "0")

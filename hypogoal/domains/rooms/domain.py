@@ -57,9 +57,10 @@ class RoomsDomain(Domain[RoomsConfig]):
     def task(self, world: Mapping[str, Any]) -> str:
         config = RoomsConfig(**world)
         others = [f"{name} ({MEANINGS[name]})" for name in config.factors if name != config.truth]
+        also = f" The labels also fit {' and '.join(others)}, for which there is no reward." if others else ""
         return (
-            f"Enter one of {config.rooms} rooms; only that where {MEANINGS[config.truth]} ({config.truth}) gives a "
-            f"reward of 1. The labels fit {' and '.join(others)} as well; in the rooms they part."
+            f"Enter one of {config.rooms} rooms. Only the room where {MEANINGS[config.truth]} ({config.truth}) gives a "
+            f"reward of 1.{also}"
         )
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int = 1, **arguments: Any) -> RoomsEngine:
