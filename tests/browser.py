@@ -24,17 +24,17 @@ needs_browser = pytest.mark.skipif(
 )
 
 
-def run_in(page: Path, script: str, folder: Path) -> tuple[str, list[str]]:
+def run_in(page: Path, script: str, folder: Path, *switches: str) -> tuple[str, list[str]]:
     """What a script at the end of a page makes its title, and the browser's lines: errors, what the policy blocked.
 
-    The page's policy is told of the script. ``folder``, of the test's own, is for the browser.
+    The page's policy is told of the script. ``folder``, of the test's own, is for the browser, as ``switches`` are.
     """
     assert CHROMIUM is not None
     digest = b64encode(sha256(script.encode()).digest()).decode()
     text = page.read_text(encoding="utf-8").replace("script-src ", f"script-src 'sha256-{digest}' ", 1)
     copy = folder / "page.html"
     copy.write_text(text.replace("</body>", f"<script>{script}</script></body>"), encoding="utf-8")
-    command = [CHROMIUM, *SWITCHES, f"--user-data-dir={folder / 'profile'}", "--dump-dom", copy.as_uri()]
+    command = [CHROMIUM, *SWITCHES, *switches, f"--user-data-dir={folder / 'profile'}", "--dump-dom", copy.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     title = re.search(r"<title>(.*?)</title>", done.stdout, re.S)
     assert title

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from browser import needs_browser, run_in
 
 import hypogoal
 from hypogoal.cli import main
@@ -55,6 +56,25 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return out
+
+
+@needs_browser
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reference/settings.html", "results/agents.html"])
+def test_the_widest_tables_fit_a_narrow_window(site: Path, name: str) -> None:
+    """Nothing has to be scrolled sideways, because each row becomes a card. Chromium has no window below 500 pixels."""
+    page = site / name
+    script = """
+        const wide = [...document.querySelectorAll("table"), document.documentElement];
+        const widths = wide.map((each) => each.scrollWidth);
+        document.title = [innerWidth, document.querySelectorAll("table[data-cards]").length, ...widths];
+    """
+    title, complaints = run_in(page, script, page.parent, "--window-size=500,900")
+    width, cards, *widths = map(int, title.split(","))
+    assert width == 500
+    assert cards
+    assert max(widths) <= width
+    assert not complaints
 
 
 def test_the_reference_is_that_of_the_code(site: Path) -> None:
