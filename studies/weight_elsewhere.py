@@ -158,7 +158,8 @@ def run_cell(name: str, method: str, seed: int) -> list[Row]:
 def tables(path: Path) -> Iterator[str]:
     """What the rows say, as lines of Markdown: a table of data with planted features, and one of those without."""
     rows = read_rows(path)
-    planted, others = [], []
+    planted: list[list[str]] = []
+    others: list[list[str]] = []
     for name, case in CASES.items():
         for method in case.methods:
             cells = [row for row in rows if (row["case"], row["method"]) == (name, method)]
