@@ -68,7 +68,7 @@ def sheets(split: States) -> Iterator[tuple[str, Bytes]]:
 
 
 def sheet(observations: Bytes) -> Bytes:
-    """Observations uint8 (n, H, W, C) in rows of ``COLUMNS``, uint8 (height, width, 3); black where there is none."""
+    """Return observations, uint8 (n, H, W, C), in rows of ``COLUMNS``: uint8 (height, width, 3), padded with black."""
     shown = coloured(observations)
     missing = -len(shown) % COLUMNS
     padded = np.pad(shown, ((0, missing), (GAP, GAP), (GAP, GAP), (0, 0)))
