@@ -144,7 +144,7 @@ def _typed(value: Any) -> str:
 
 
 def faults(path: Path) -> list[str]:
-    """A line for each data file that cannot be read, and each file or input within that is missing or changed."""
+    """Return a line for each unreadable data file, and each file or input in ``path`` that is missing or changed."""
     lines = []
     for part in parts_of(path):
         try:
