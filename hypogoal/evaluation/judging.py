@@ -80,10 +80,10 @@ class Work:
         return sorted(artefacts, key=lambda artefact: rank(self.place(artefact)["method"]))
 
     def judgements(self) -> Iterator[Judgement]:
-        """Judge every sub-goal of every ensemble, in any number of processes, and yield them, the paper's method first.
+        """Judge every sub-goal of every ensemble, in any number of processes, and yield the judgements.
 
-        Ensembles on the same states are judged one after another, since each process keeps the last states that it
-        read.
+        The paper's method comes first. Ensembles on the same states are judged one after another, since each process
+        keeps the last states that it read.
         """
         ranked = self.ranked(self.contents.ensembles)
         ensembles = [(artefact, self.contents.data_of[artefact.path]) for artefact in ranked]

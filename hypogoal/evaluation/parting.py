@@ -66,9 +66,9 @@ def pick_to_explain(
 ) -> dict[str, int]:
     """Return, by kind, the few of N states whose attributions Figures 2 and 9 draw. No state is picked twice.
 
-    ``true positive``: most of K members are right, and they are surest on average. ``disagree``: members differ, and
-    their probabilities are furthest apart. ``false positive``: most members err, and they are surest. A kind may lack a
-    state.
+    ``true positive``: most of K members are right, and members are surest on average. ``disagree``: members differ, and
+    their probabilities are furthest apart. ``false positive``: most members err, and members are surest on average. A
+    kind may lack a state.
     """
     positive = predictions.sum(axis=1)
     some = positive > 0

@@ -56,7 +56,7 @@ class Contents:
     continued: list[Artefact]  # options that a meta artefact continues; judging that artefact judges them
 
     def everything(self) -> list[Artefact]:
-        """Return all artefacts that are judged."""
+        """Return all artefacts that are evaluated."""
         return [*self.ensembles, *self.agents, *self.ladders]
 
     @cached_property

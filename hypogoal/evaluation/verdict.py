@@ -60,7 +60,7 @@ def outcome_of(low: float, high: float) -> str:
 def finding(subject: str, first: pd.DataFrame, second: pd.DataFrame, on: list[str]) -> list[dict[str, Any]]:
     """Return a comparison of two shares, over runs that agree in ``on``, or nothing if there are no pairs.
 
-    Each layout or ladder counts once. If there is only one, each run counts once.
+    Each layout or ladder counts once. If there is only one layout or ladder, each run counts once.
     """
     both = paired(first, second.drop_duplicates(on), on)
     if both.empty:
@@ -113,9 +113,10 @@ def among_members(agent: str, results: Results) -> dict[str, float]:
 
 
 def how_soon(agent: str, results: Results) -> dict[str, float]:
-    """Return after how many ``episodes`` 95 % of the last ones were solved, and the share of runs that ``got_there``.
+    """Return after how many ``episodes`` 95 % of recent episodes were solved, and the share of runs that ``got_there``.
 
-    ``episodes`` is the median of the runs that got there. ``trained`` is the median of how many a training had.
+    ``episodes`` is the median of the runs that got there. ``trained`` is the median number of a run's training
+    episodes.
     """
     own = results.of(method=agent)
     soon, trained, every = (per_run(own, name)["value"] for name in ("episodes_to_95", "episodes", "success"))
