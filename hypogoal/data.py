@@ -1,9 +1,9 @@
-"""The HDF5 file of collected states: labelled, unlabelled, held-out.
+"""The HDF5 file of collected states: labelled, unlabelled and held-out.
 
-``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations``, ``heldout/<sub-goal>/{observations,labels}``
-and, beside each, ``origin/*`` per state. Sub-goals with the same states share one dataset on disk (hard links). The
-root's attributes hold format version, domain, observation space, arguments and versions. ``complete`` is set last, so a
-file without it was cut off.
+The file has ``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations``,
+``heldout/<sub-goal>/{observations,labels}`` and, beside each, ``origin/*`` per state. Sub-goals with the same states
+share one dataset on disk (hard links). The root's attributes hold format version, domain, observation space, arguments
+and versions. ``complete`` is set last, so a file without it was cut off.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from hypogoal.observations import (
     type_text,
 )
 
-DATA_FORMAT = 2  # 1: texts of variable length
+DATA_FORMAT = 2  # format 1 had texts of variable length
 SPLITS = ("labelled", "heldout")
 RECOLLECT = "Collect it again."
 ANEW = "Bring all files that it is made of, or write it again, whole."
 GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
-GROUP = "group"  # an origin: states of a group are held out together, to choose a weight by
-PLANTED = "planted_"  # begins the names of origins that say whether a state has a feature
+GROUP = "group"  # an origin; to choose a weight, the states of a group are held out together
+PLANTED = "planted_"  # how the names of origins begin that say whether a state has a feature
 FEW = 10  # warn below this number of labelled states of a class
 RARE = 0.05  # warn below this share of a class
-COLUMN_CHUNK = 1 << 16  # values of a label or origin
+COLUMN_CHUNK = 1 << 16  # values of a label or origin in a chunk
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class States:
     Attributes:
         observations: uint8 or float32 (N, *observation_shape), or mixed (N,).
         labels: bool (N, G), one column per sub-goal; (N,) for a single sub-goal.
-        origins: int (N,) arrays by name, where each state comes from (layout_seed, agent_x, ...).
+        origins: int (N,) arrays by name, which say where a state comes from (layout_seed, agent_x, ...).
     """
 
     observations: Observations
@@ -63,7 +63,7 @@ class States:
     origins: Mapping[str, Ints] = field(default_factory=dict)
 
     def where(self, kept: Array) -> States:
-        """The states that are ``kept``, bool (N,), or the rows of some, int (M,)."""
+        """Return the states where ``kept``, bool (N,), is true, or the states at the rows ``kept``, int (M,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
         observations = self.observations[kept]
         return States(observations, self.labels[kept], origins)
@@ -73,8 +73,8 @@ class States:
 class Collected:
     """What a domain's ``collect`` returns: three sets of states, the names of sub-goals (G) and of features, if any.
 
-    ``channels`` says of each key's pictures, "" of those without, how many frames of how many colours their channels
-    are; it is empty if nobody said so.
+    ``channels`` says, for the pictures of each key, how many frames of how many colours the channels are. The key of a
+    picture without a key is "". ``channels`` is empty if this is unknown.
     """
 
     observation_shape: Shape
@@ -87,18 +87,18 @@ class Collected:
 
 
 class Unmet(UserError):
-    """Play did not reach the states needed."""
+    """The error that play did not reach the states needed."""
 
 
 def leave_out(states: States, *training: Observations) -> States:
-    """The states without those that look like one of ``training``, observations (M, ...) each."""
+    """Return the states whose observations are not among ``training``, observations (M, ...) each."""
     digests = set(map(digest, chain(*training)))
     apart = [digest(observation) not in digests for observation in states.observations]
     return states.where(np.array(apart, bool))
 
 
 def joined(parts: Sequence[States]) -> States:
-    """The states of all parts, with the origins that all of them have."""
+    """Return the states of all parts, with the origins that all parts have."""
     if len(parts) == 1:
         return parts[0]
     observations = np.concatenate([part.observations for part in parts])
@@ -111,9 +111,9 @@ def joined(parts: Sequence[States]) -> States:
 
 
 def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str]:
-    """A line for each sub-goal with few labelled states of a class, or one class only among the held-out states.
+    """Return a line for each doubt about the sub-goals' labels, (N, G) of labelled and (M, G) of held-out states.
 
-    Labels are (N, G) and (M, G).
+    A doubt is that few labelled states are of a class, or that the held-out states have one class only.
     """
     lines = []
     for goal, column, judged in zip(goals, labelled.T, heldout.T, strict=True):
@@ -126,7 +126,7 @@ def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str
 
 
 def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str) -> None:
-    """Refuse (``Unmet``) labels (N, G) of labelled states that have one class only for some sub-goal."""
+    """Raise ``Unmet`` if the labels (N, G) of labelled states have one class only for some sub-goal."""
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
             lacking = "negatives" if column.any() else "positives"
@@ -134,7 +134,7 @@ def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str)
 
 
 def require_names(sub_goals: Sequence[str]) -> None:
-    """Refuse (``UserError``) an empty list, names that are not plain, and names that differ only in case."""
+    """Raise ``UserError`` if there are no names, if a name is not plain, or if names differ only in case."""
     if not plain_names(sub_goals):
         do = f"Give one or more, different even if case is ignored, without separators and {' '.join(NO_FILE_NAME)}"
         raise UserError("sub-goals need different names that are usable as file names", ", ".join(sub_goals), f"{do}.")
@@ -142,7 +142,10 @@ def require_names(sub_goals: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> Iterator[Any]:
-    """An HDF5 file opened for reading; whatever cannot be read in the block is a ``UserError``."""
+    """Give an HDF5 file opened for reading.
+
+    Raises ``UserError`` if something in the block cannot be read.
+    """
     import h5py
 
     with reading(path, do, subject), h5py.File(path, "r", locking="best-effort") as file:
@@ -151,9 +154,9 @@ def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> I
 
 @contextlib.contextmanager
 def create_hdf5(path: Path) -> Iterator[Any]:
-    """A fresh HDF5 file to fill, built in memory and written when the block ends.
+    """Give a new HDF5 file to fill, which is built in memory and written when the block ends.
 
-    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16); writing the finished bytes
+    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16). Writing the finished bytes
     ourselves raises a normal ``OSError``.
     """
     import h5py
@@ -167,9 +170,10 @@ def create_hdf5(path: Path) -> Iterator[Any]:
 
 
 def whole(data: Any) -> Any:
-    """An HDF5 dataset all of whose values are stored, else a ``UserError``: HDF5 reads others for those that are not.
+    """Return an HDF5 dataset if all of its values are stored.
 
-    Chunks and arrays may never have been written, raw files and parts of a virtual dataset may be gone.
+    Raises ``UserError`` if not, because HDF5 reads other values for those that are not stored. Chunks and arrays may
+    never have been written, and raw files or parts of a virtual dataset may be gone.
     """
     is_whole = data.id.get_storage_size() > 0 or not data.size
     if data.chunks:
@@ -185,7 +189,7 @@ def whole(data: Any) -> Any:
 
 
 def _is_covered(data: Any) -> bool:
-    """Whether the parts of a virtual dataset, which must be whole, leave no gap in it."""
+    """Return whether the parts of a virtual dataset, which must be whole, leave no gap in the dataset."""
     import h5py
 
     whole_file = Path(data.file.filename)
@@ -201,7 +205,10 @@ def _is_covered(data: Any) -> bool:
 
 
 def fixed(text: str) -> Array:
-    """A text as a fixed-length UTF-8 string, stored in place; variable-length ones lie in HDF5's global heap."""
+    """Return a text as a fixed-length UTF-8 string, which is stored in place.
+
+    A text of variable length would lie in HDF5's global heap.
+    """
     import h5py
 
     data = text.encode()
@@ -216,9 +223,9 @@ def write_dataset(
     config: Mapping[str, Any],
     seed: int,
 ) -> None:
-    """Write collected states; a file of that name is replaced once the new one is complete.
+    """Write collected states. A file of that name is replaced once the new file is complete.
 
-    Raises ``UserError`` if a name cannot be a file name, labels are not truth values or numbers not finite.
+    Raises ``UserError`` if a name cannot be a file name, if labels are not truth values, or if numbers are not finite.
     """
     require_names(collected.sub_goals)
     attributes = {
@@ -247,7 +254,7 @@ def write_dataset(
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]) -> None:
-    """A group for each sub-goal; the same states are stored once, with a hard link in each group."""
+    """Write a group for each sub-goal. The states are stored once, with a hard link in each group."""
     labels = np.asarray(states.labels)
     if labels.dtype != bool:  # NumPy turns the text 'False' into True
         raise UserError(f"the domain's {split} labels are not truth values", labels.dtype, "Give bool (N, sub-goals).")
@@ -256,7 +263,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
     columns = labels.reshape(len(labels), len(sub_goals))
     for sub_goal, column in zip(sub_goals, columns.T, strict=True):
         group = file.require_group(f"{split}/{sub_goal}")
-        for name in ("observations", "origin"):  # in this order, whatever the hashes of this process
+        for name in ("observations", "origin"):  # in this order in every process, so not from a set
             if name in first and name not in group:
                 group[name] = first[name]
         _store(group, "labels", column)
@@ -273,7 +280,7 @@ def _write_states(group: Any, states: States) -> None:
 
 
 def _store(group: Any, name: str, values: Array) -> None:
-    """Write observations compressed, other values with checksums: a flipped label would still be valid."""
+    """Write observations compressed, and other values with checksums, because a flipped label would still be valid."""
     filters = {}
     count = len(values)
     if count and name == "observations":
@@ -287,7 +294,7 @@ def _store(group: Any, name: str, values: Array) -> None:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A complete data file, of which states are read when asked for. Use :func:`open_dataset`."""
+    """A complete data file, whose states are read when asked for. Use :func:`open_dataset`."""
 
     path: Path
     domain: str
@@ -300,13 +307,14 @@ class Dataset:
 
     @property
     def observation_bytes(self) -> int:
-        """Of one observation."""
+        """The size of one observation in bytes."""
         return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     def features(self) -> list[str]:
-        """The names of an observation's numbers, in order: the file's own, else ``x[0]``, ``x[1]``, ...
+        """Return the names of an observation's numbers, in order.
 
-        Of a mixed observation ``key[0]``, ``key[1]``, ..., and a picture's key alone.
+        They are the file's own names or, if it has none, ``x[0]``, ``x[1]``, ... Those of a mixed observation are
+        ``key[0]``, ``key[1]``, ..., but a picture, or a single number, has its key as the name.
         """
         with opened(self.path) as file:
             if "features" in file:
@@ -319,28 +327,31 @@ class Dataset:
         return names
 
     def labelled(self, sub_goal: str) -> States:
-        """The labelled states of one sub-goal."""
+        """Return the labelled states of one sub-goal."""
         return self._states("labelled", sub_goal)
 
     def heldout(self, sub_goal: str) -> States:
-        """The held-out states of one sub-goal with their true labels, for evaluation only."""
+        """Return the held-out states of one sub-goal with their true labels, for evaluation only."""
         return self._states("heldout", sub_goal)
 
     def all_heldout(self) -> dict[str, States]:
-        """The held-out states of every sub-goal; one array of those that the file holds once."""
+        """Return the held-out states of every sub-goal.
+
+        Sub-goals whose states the file holds once share one array.
+        """
         read: dict[int, Observations] = {}
         return {sub_goal: self._states("heldout", sub_goal, read) for sub_goal in self.sub_goals}
 
     def unlabelled(self) -> Observations:
-        """The unlabelled states: uint8 or float32 (M, *obs)."""
+        """Return the observations of the unlabelled states: uint8 or float32 (M, *obs)."""
         return self.unlabelled_states().observations
 
     def unlabelled_states(self) -> States:
-        """The same with their origins, if the file has any, and no labels, (M, 0)."""
+        """Return the unlabelled states with their origins, if the file has any, and labels (M, 0)."""
         return self._states("unlabelled")
 
     def counts(self) -> dict[str, Any]:
-        """Numbers of states and positives, without reading the observations."""
+        """Return the numbers of states and positives, without reading the observations."""
         with opened(self.path) as file:
             counts: dict[str, Any] = {"unlabelled": len(file["unlabelled/observations"])}
             for split in SPLITS:
@@ -351,9 +362,10 @@ class Dataset:
             return counts
 
     def _states(self, split: str, sub_goal: str = "", read: dict[int, Observations] | None = None) -> States:
-        """The states of a split; what is not as the root's attributes say is a ``UserError``.
+        """Return the states of a split.
 
-        ``read``, by where they lie in the file: observations that need not be read again.
+        ``read`` has observations that need not be read again, by their place in the file. Raises ``UserError`` if the
+        states are not as the root's attributes say.
         """
         import h5py
 
@@ -383,13 +395,13 @@ class Dataset:
 
 
 def _plain(attribute: Any) -> Any:
-    """An attribute as Python's own: a text, int, float or bool."""
+    """Return an attribute as Python's own text, int, float or bool."""
     value = np.asarray(attribute).item()
     return value.decode() if isinstance(value, bytes) else value
 
 
 def _column(group: Any, name: str) -> Array:
-    """One value for each state of a group."""
+    """Return one value for each state of a group."""
     values, states = whole(group[name])[()], len(group["observations"])
     if values.shape != (states,):
         raise ValueError(f"{group.name}/{name} of shape {values.shape} for {states} states")
@@ -397,7 +409,10 @@ def _column(group: Any, name: str) -> Array:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
+    """Open a data file written by ``collect``, or by the user in the same schema.
+
+    Raises ``UserError`` if ``path`` is no such file, has another format, or is not complete.
+    """
     with opened(path) as file:
         attributes = {name: _plain(value) for name, value in file.attrs.items()}
         version = attributes.get("format")
