@@ -64,12 +64,24 @@ def plan(
     stages = dict.fromkeys(cell.stage for cell in cells)
     for stage in of_stage.keys() - stages:
         raise UserError("no such stage in --set", stage, f"This run has {', '.join(stages)}.")
+    if STAGE not in experiment.arguments:
+        _refuse_ignored(cells, of_stage)
     if config.evaluate:
         everything = [cell.place for cell in cells]
         evaluation = Cell(name="evaluation", words=["evaluate", HERE], needs=everything, run=run)
         report = Cell(name="report", words=["report", HERE], needs=[evaluation.place], run=run)
         cells += [evaluation, report]
     return cells, config.workers
+
+
+def _refuse_ignored(cells: Iterable[Cell], settings: Mapping[str, Mapping[str, str]]) -> None:
+    """Raise ``UserError`` if no command has a setting, by stage, that the user gave for all commands of its stage."""
+    for stage, shared in settings.items():
+        of_stage = [cell.words for cell in cells if cell.stage == stage]
+        for name, value in shared.items():
+            if not any(f"{name}={value}" in words for words in of_stage):
+                fault = f"each {stage} of this experiment has a value of its own, or another choice"
+                raise UserError(fault, f"{stage}.{name}", f"Leave it out, or give the command {stage} yourself.")
 
 
 def _check_names(config: Config, usual: Config) -> None:
