@@ -76,7 +76,7 @@ class Collected:
 
     Attributes:
         observation_shape: the shape of one observation.
-        sub_goals: their names (G).
+        sub_goals: the names of the sub-goals (G).
         labelled, unlabelled, heldout: the three sets of states.
         features: the names of an observation's numbers, or empty if they have no names.
         channels: for stacked pictures, how many frames of how many colours their channels are, by key. The key of an
@@ -321,7 +321,7 @@ class Dataset:
         """Return the names of an observation's numbers, in order.
 
         If the file has no names, they are ``x[0]``, ``x[1]``, ... For a mixed observation they are ``key[0]``,
-        ``key[1]``, ..., and a picture has its key alone.
+        ``key[1]``, ..., but a picture or a single number has its key alone.
         """
         with opened(self.path) as file:
             if "features" in file:
