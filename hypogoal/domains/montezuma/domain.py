@@ -82,8 +82,8 @@ def choose_rooms(config: MontezumaConfig) -> tuple[list[int], list[int]]:
     """Return the rooms of the labelled states, and the rooms of the unlabelled states.
 
     Labelled states are from the first N groups of each sub-goal. Unlabelled states are from two rooms. In the first
-    room, which has no labels, the first sub-goal holds somewhere. In the second room it holds nowhere. If all rooms in
-    which the sub-goal holds have labels, it holds in neither room. Source: the paper, for N = 1.
+    room, which has no labels, the first sub-goal holds somewhere. In the second room the sub-goal holds nowhere. If all
+    rooms in which the sub-goal holds have labels, it holds in neither room. Source: the paper, for N = 1.
     """
     labelled: list[int] = []
     for name in config.sub_goals:

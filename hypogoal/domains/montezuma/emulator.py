@@ -245,7 +245,7 @@ def pixel(positions: Ints) -> Doubles:
 def picture(emulator: Emulator, room: int) -> Bytes:
     """Draw a room as the console shows it, with enemies but without the agent, uint8 (210, 160, 3).
 
-    The picture is made of three pictures with the agent at three places. At every pixel two of them agree.
+    The picture is the median of three pictures with the agent at three places, two of which agree at every pixel.
     """
     shots = []
     for x in THREE_PLACES:

@@ -90,7 +90,7 @@ class MontezumaEngine(TurnEngine):
         return judge_sub_goals(facts, SUB_GOALS.values())
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that a resumed run needs. Nearly all of it are the frames in memory."""
+        """Return all that a resumed run needs, which is mostly the frames in memory."""
         stacks = [*self._seen.values()]
         stacks += [emulator.seen for emulator in self._emulators]
         frames = {id(frame): frame for frame in chain(*stacks)}  # each frame once
