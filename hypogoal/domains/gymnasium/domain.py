@@ -62,10 +62,10 @@ class GymnasiumDomain(Domain[GymnasiumConfig]):
         origins: by name, functions of the environment that return numbers to keep beside each state. A name that begins
             with ``planted_`` is that of a feature, which holds or not. Evaluation says how well members tell the
             feature, and labelled and held-out states are drawn evenly over combinations of features, too.
-        plan: whether options can be planned (``network=planned``). If so, every layout is walked through before. True:
-            observations and labels identify a state of a layout. If they hide something, such as the agent's place,
-            give a function of the environment that returns what is hidden. The environment must be deterministic, with
-            at most some 50,000 states.
+        plan: whether options can be planned (``network=planned``), for which every layout is walked through first.
+            True: observations and labels identify a state of a layout. If observations hide something, such as the
+            agent's place, give a function of the environment that returns what is hidden. The environment must be
+            deterministic, with at most some 50,000 states.
         defaults: by stage, settings that suit this domain, such as ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: the number of distinct states whose observations training keeps, see ``GymnasiumEngine``.
         name: the domain's name in messages. Artefacts use the name that the user passed to ``collect``.
