@@ -5,7 +5,7 @@ image is eight strips, which are rows of cells. Few strips differ, so each strip
 
 A state is a *configuration* (the layout, its door and where its three keys are) and a *pose* (the agent's cell and
 direction). Turning and walking change the pose only, by table look-ups in NumPy. Picking up, dropping and toggling
-change the configuration. They are rare, so plain Python computes them. Every state reached gets an id.
+change the configuration. Such changes are rare, so plain Python computes them. Every state reached gets an id.
 """
 
 from collections.abc import Mapping, Sequence
