@@ -71,7 +71,7 @@ class EpisodeRecorder(Resumable):
     def recent(self) -> dict[str, float]:
         """Return the share of successes (see ``Step``) and the mean length of the last ``LAST`` episodes.
 
-        Both are NaN before the first episode has ended.
+        The two numbers are NaN before the first episode has ended.
         """
         last = self.rows[-LAST:]
         if not last:
@@ -84,7 +84,7 @@ class EpisodeRecorder(Resumable):
     def solved(self, share: float) -> bool:
         """Return whether at least ``share`` of the last ``LAST`` episodes succeeded.
 
-        That is false if ``share`` is 0, or if fewer episodes have ended.
+        Return false if ``share`` is 0, or if fewer than ``LAST`` episodes have ended.
         """
         return share > 0 and len(self.rows) >= LAST and self.recent()["success"] >= share
 
