@@ -1,9 +1,10 @@
-"""The HDF5 file of collected states: labelled, unlabelled and held-out.
+"""The HDF5 file of collected states, which are labelled, unlabelled or held out.
 
-The file has ``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations``,
-``heldout/<sub-goal>/{observations,labels}`` and, beside each, ``origin/*`` per state. Sub-goals with the same states
-share one dataset on disk (hard links). The root's attributes hold format version, domain, observation space, arguments
-and versions. ``complete`` is set last, so a file without it was cut off.
+The file has the datasets ``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations`` and
+``heldout/<sub-goal>/{observations,labels}``. Beside the observations, ``origin/*`` has a number for each state.
+Sub-goals with the same states share one dataset on disk (hard links). The root's attributes are the version of the
+format, the domain, the observation space, the arguments and the versions. The attribute ``complete`` becomes true last,
+so a file in which it is false was cut off.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ from hypogoal.observations import (
     type_text,
 )
 
-DATA_FORMAT = 2  # format 1 had texts of variable length
+DATA_FORMAT = 2  # in format 1 texts had variable length
 SPLITS = ("labelled", "heldout")
 RECOLLECT = "Collect it again."
 ANEW = "Bring all files that it is made of, or write it again, whole."
 GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
 GROUP = "group"  # an origin; to choose a weight, the states of a group are held out together
-PLANTED = "planted_"  # how the names of origins begin that say whether a state has a feature
-FEW = 10  # warn below this number of labelled states of a class
-RARE = 0.05  # warn below this share of a class
-COLUMN_CHUNK = 1 << 16  # values of a label or origin in a chunk
+PLANTED = "planted_"  # the beginning of the names of origins that say whether a state has a feature
+FEW = 10  # with fewer labelled states of a class, a warning is given
+RARE = 0.05  # with a smaller share of a class among the labelled states, a warning is given
+COLUMN_CHUNK = 1 << 16  # values of labels or of an origin in a chunk
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ class States:
 
     Attributes:
         observations: uint8 or float32 (N, *observation_shape), or mixed (N,).
-        labels: bool (N, G), one column per sub-goal; (N,) for a single sub-goal.
-        origins: int (N,) arrays by name, which say where a state comes from (layout_seed, agent_x, ...).
+        labels: bool (N, G), one column per sub-goal, or (N,) for a single sub-goal.
+        origins: by name, int (N,), where each state comes from (layout_seed, agent_x, ...).
     """
 
     observations: Observations
@@ -63,7 +64,7 @@ class States:
     origins: Mapping[str, Ints] = field(default_factory=dict)
 
     def where(self, kept: Array) -> States:
-        """Return the states where ``kept``, bool (N,), is true, or the states at the rows ``kept``, int (M,)."""
+        """Return the states that ``kept`` names, either a mask, bool (N,), or their rows, int (M,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
         observations = self.observations[kept]
         return States(observations, self.labels[kept], origins)
@@ -71,10 +72,15 @@ class States:
 
 @dataclass(frozen=True)
 class Collected:
-    """What a domain's ``collect`` returns: three sets of states, the names of sub-goals (G) and of features, if any.
+    """What a domain's ``collect`` returns.
 
-    ``channels`` says, for the pictures of each key, how many frames of how many colours the channels are. The key of a
-    picture without a key is "". ``channels`` is empty if this is unknown.
+    Attributes:
+        observation_shape: the shape of one observation.
+        sub_goals: the names of the sub-goals (G).
+        labelled, unlabelled, heldout: the three sets of states.
+        features: the names of an observation's numbers, or empty if they have no names.
+        channels: for stacked pictures, how many frames of how many colours their channels are, by key. The key of an
+            observation that is not mixed is "".
     """
 
     observation_shape: Shape
@@ -83,22 +89,22 @@ class Collected:
     unlabelled: States
     heldout: States
     features: tuple[str, ...] = ()
-    channels: Mapping[str, Sequence[int]] = field(default_factory=dict)  # frames and colours of stacks, by key
+    channels: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
 
 class Unmet(UserError):
-    """The error that play did not reach the states needed."""
+    """An error because play did not reach the states needed."""
 
 
 def leave_out(states: States, *training: Observations) -> States:
-    """Return the states whose observations are not among ``training``, observations (M, ...) each."""
+    """Return the states whose observations are in none of the sets ``training``, of observations (M, ...) each."""
     digests = set(map(digest, chain(*training)))
     apart = [digest(observation) not in digests for observation in states.observations]
     return states.where(np.array(apart, bool))
 
 
 def joined(parts: Sequence[States]) -> States:
-    """Return the states of all parts, with the origins that all parts have."""
+    """Return the states of all parts as one set, with the origins that all parts have."""
     if len(parts) == 1:
         return parts[0]
     observations = np.concatenate([part.observations for part in parts])
@@ -111,9 +117,10 @@ def joined(parts: Sequence[States]) -> States:
 
 
 def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str]:
-    """Return a line for each doubt about the sub-goals' labels, (N, G) of labelled and (M, G) of held-out states.
+    """Return a line for each doubt whether the labels suffice.
 
-    A doubt is that few labelled states are of a class, or that the held-out states have one class only.
+    A sub-goal is in doubt if a class has few labelled states, or if the held-out states are of one class only.
+    ``labelled`` (N, G) and ``heldout`` (M, G) are labels.
     """
     lines = []
     for goal, column, judged in zip(goals, labelled.T, heldout.T, strict=True):
@@ -126,7 +133,10 @@ def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str
 
 
 def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str) -> None:
-    """Raise ``Unmet`` if the labels (N, G) of labelled states have one class only for some sub-goal."""
+    """Raise ``Unmet`` if the labels (N, G) of labelled states are of one class only for a sub-goal.
+
+    ``where`` and ``do`` are parts of the error.
+    """
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
             lacking = "negatives" if column.any() else "positives"
@@ -134,7 +144,7 @@ def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str)
 
 
 def require_names(sub_goals: Sequence[str]) -> None:
-    """Raise ``UserError`` if there are no names, if a name is not plain, or if names differ only in case."""
+    """Raise ``UserError`` if there are no names, if a name is not plain, or if two names differ only in case."""
     if not plain_names(sub_goals):
         do = f"Give one or more, different even if case is ignored, without separators and {' '.join(NO_FILE_NAME)}"
         raise UserError("sub-goals need different names that are usable as file names", ", ".join(sub_goals), f"{do}.")
@@ -142,10 +152,7 @@ def require_names(sub_goals: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> Iterator[Any]:
-    """Give an HDF5 file opened for reading.
-
-    Raises ``UserError`` if something in the block cannot be read.
-    """
+    """Open an HDF5 file for reading. Raises ``UserError`` if anything cannot be read within the context."""
     import h5py
 
     with reading(path, do, subject), h5py.File(path, "r", locking="best-effort") as file:
@@ -154,10 +161,10 @@ def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> I
 
 @contextlib.contextmanager
 def create_hdf5(path: Path) -> Iterator[Any]:
-    """Give a new HDF5 file to fill, which is built in memory and written when the block ends.
+    """Give a new HDF5 file, which is built in memory and written when the context ends.
 
-    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16). Writing the finished bytes
-    ourselves raises a normal ``OSError``.
+    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16), but writing the finished
+    bytes ourselves raises a normal ``OSError``.
     """
     import h5py
 
@@ -170,10 +177,10 @@ def create_hdf5(path: Path) -> Iterator[Any]:
 
 
 def whole(data: Any) -> Any:
-    """Return an HDF5 dataset if all of its values are stored.
+    """Return the HDF5 dataset ``data``. Raises ``UserError`` if some of its values are not stored.
 
-    Raises ``UserError`` if not, because HDF5 reads other values for those that are not stored. Chunks and arrays may
-    never have been written, and raw files or parts of a virtual dataset may be gone.
+    HDF5 reads other values in place of those that are not stored. Values are not stored where chunks or arrays were
+    never written, or where raw files or parts of a virtual dataset are gone.
     """
     is_whole = data.id.get_storage_size() > 0 or not data.size
     if data.chunks:
@@ -189,7 +196,7 @@ def whole(data: Any) -> Any:
 
 
 def _is_covered(data: Any) -> bool:
-    """Return whether the parts of a virtual dataset, which must be whole, leave no gap in the dataset."""
+    """Return whether the parts of a virtual dataset leave no gap in it. Raises ``UserError`` if a part lacks values."""
     import h5py
 
     whole_file = Path(data.file.filename)
@@ -205,9 +212,9 @@ def _is_covered(data: Any) -> bool:
 
 
 def fixed(text: str) -> Array:
-    """Return a text as a fixed-length UTF-8 string, which is stored in place.
+    """Return a text as a UTF-8 string of fixed length.
 
-    A text of variable length would lie in HDF5's global heap.
+    HDF5 stores a string of fixed length in place, but a string of variable length in its global heap.
     """
     import h5py
 
@@ -223,7 +230,7 @@ def write_dataset(
     config: Mapping[str, Any],
     seed: int,
 ) -> None:
-    """Write collected states. A file of that name is replaced once the new file is complete.
+    """Write collected states to ``path``. An earlier file there is replaced once the new file is complete.
 
     Raises ``UserError`` if a name cannot be a file name, if labels are not truth values, or if numbers are not finite.
     """
@@ -263,7 +270,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
     columns = labels.reshape(len(labels), len(sub_goals))
     for sub_goal, column in zip(sub_goals, columns.T, strict=True):
         group = file.require_group(f"{split}/{sub_goal}")
-        for name in ("observations", "origin"):  # in this order in every process, so not from a set
+        for name in ("observations", "origin"):  # in this order, whatever the hashes of this process
             if name in first and name not in group:
                 group[name] = first[name]
         _store(group, "labels", column)
@@ -294,7 +301,7 @@ def _store(group: Any, name: str, values: Array) -> None:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A complete data file, whose states are read when asked for. Use :func:`open_dataset`."""
+    """A complete data file, from which states are read when they are asked for. Use :func:`open_dataset`."""
 
     path: Path
     domain: str
@@ -313,8 +320,8 @@ class Dataset:
     def features(self) -> list[str]:
         """Return the names of an observation's numbers, in order.
 
-        They are the file's own names or, if it has none, ``x[0]``, ``x[1]``, ... Those of a mixed observation are
-        ``key[0]``, ``key[1]``, ..., but a picture, or a single number, has its key as the name.
+        If the file has no names, they are ``x[0]``, ``x[1]``, ... For a mixed observation they are ``key[0]``,
+        ``key[1]``, ..., but a picture or a single number has its key alone.
         """
         with opened(self.path) as file:
             if "features" in file:
@@ -331,27 +338,24 @@ class Dataset:
         return self._states("labelled", sub_goal)
 
     def heldout(self, sub_goal: str) -> States:
-        """Return the held-out states of one sub-goal with their true labels, for evaluation only."""
+        """Return the held-out states of one sub-goal with their true labels, which are for evaluation only."""
         return self._states("heldout", sub_goal)
 
     def all_heldout(self) -> dict[str, States]:
-        """Return the held-out states of every sub-goal.
-
-        Sub-goals whose states the file holds once share one array.
-        """
+        """Return the held-out states by sub-goal. Observations that the file holds once are one array."""
         read: dict[int, Observations] = {}
         return {sub_goal: self._states("heldout", sub_goal, read) for sub_goal in self.sub_goals}
 
     def unlabelled(self) -> Observations:
-        """Return the observations of the unlabelled states: uint8 or float32 (M, *obs)."""
+        """Return the observations of the unlabelled states, (M, *observation_shape)."""
         return self.unlabelled_states().observations
 
     def unlabelled_states(self) -> States:
-        """Return the unlabelled states with their origins, if the file has any, and labels (M, 0)."""
+        """Return the unlabelled states with their origins, if the file has any. Their labels are empty, (M, 0)."""
         return self._states("unlabelled")
 
     def counts(self) -> dict[str, Any]:
-        """Return the numbers of states and positives, without reading the observations."""
+        """Count the states of each set, and the positives among them by sub-goal, without reading the observations."""
         with opened(self.path) as file:
             counts: dict[str, Any] = {"unlabelled": len(file["unlabelled/observations"])}
             for split in SPLITS:
@@ -362,10 +366,9 @@ class Dataset:
             return counts
 
     def _states(self, split: str, sub_goal: str = "", read: dict[int, Observations] | None = None) -> States:
-        """Return the states of a split.
+        """Return the states of a split. Raises ``UserError`` if they are not as the root's attributes say.
 
-        ``read`` has observations that need not be read again, by their place in the file. Raises ``UserError`` if the
-        states are not as the root's attributes say.
+        ``read`` are the observations that were read already, by their place in the file.
         """
         import h5py
 
@@ -395,13 +398,13 @@ class Dataset:
 
 
 def _plain(attribute: Any) -> Any:
-    """Return an attribute as Python's own text, int, float or bool."""
+    """Return an attribute as a Python str, int, float or bool."""
     value = np.asarray(attribute).item()
     return value.decode() if isinstance(value, bytes) else value
 
 
 def _column(group: Any, name: str) -> Array:
-    """Return one value for each state of a group."""
+    """Return the values of a dataset that has one value for each state of a group, (N,)."""
     values, states = whole(group[name])[()], len(group["observations"])
     if values.shape != (states,):
         raise ValueError(f"{group.name}/{name} of shape {values.shape} for {states} states")
@@ -409,10 +412,7 @@ def _column(group: Any, name: str) -> Array:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Open a data file written by ``collect``, or by the user in the same schema.
-
-    Raises ``UserError`` if ``path`` is no such file, has another format, or is not complete.
-    """
+    """Open a data file that ``collect`` wrote, or the user in the same schema. Raises ``UserError`` for other files."""
     with opened(path) as file:
         attributes = {name: _plain(value) for name, value in file.attrs.items()}
         version = attributes.get("format")

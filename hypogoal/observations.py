@@ -1,7 +1,8 @@
-"""What an observation is: a picture, numbers, or several of both by key. How numbers are standardised.
+"""Observations: their shapes and types, and how numbers are standardised.
 
-Pictures are bytes (H, W, C). Numbers are float32 of any shape; networks see them standardised. Several of both are
-mixed: an observation of shape () and of a structured type, which has a field for each key.
+An observation is a picture, numbers, or mixed. Pictures are uint8 (H, W, C). Numbers are float32 of any shape, and
+networks see them in deviations from their mean. A mixed observation has several pictures and numbers by key. Its shape
+is (), and its type is a structured type with a field for each key.
 """
 
 import json
@@ -23,24 +24,24 @@ KINDS: dict[str, DType] = {
     "uint8": PICTURE,
     "float32": NUMBERS,
 }
-Observations = Array  # (N, *shape), pictures, numbers or mixed
-Fields = dict[str, tuple[DType, Shape]]  # type and shape of each part, by key
+Observations = Array  # (N, *shape): pictures, numbers or mixed
+Fields = dict[str, tuple[DType, Shape]]  # by key
 Standard = tuple[Floats, Floats]  # mean and deviation of numbers
-DIGEST = 16  # bytes
-DEVIATIONS = 10.0  # numbers are clipped this far from their mean, because nothing was learned beyond
-MOST_ROWS = 20_000  # the most states of an array that give mean and deviation
+DIGEST = 16  # bytes of a digest
+DEVIATIONS = 10.0  # standardised numbers are clipped to this many deviations, because nothing was learned beyond them
+MOST_ROWS = 20_000  # the most states of a set from which mean and deviation are computed
 
 
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
-    """Return ``DIGEST`` bytes that identify an observation and its labels among observations of its shape and type."""
+    """Return ``DIGEST`` bytes that identify an observation and its labels among observations of one shape and type."""
     content = observation.tobytes() + labels
     return blake2b(content, digest_size=DIGEST).digest()
 
 
 def fields_of(shape: Shape, dtype: DType) -> Fields:
-    """Return type and shape of an observation's parts, by key.
+    """Return the type and shape of an observation's parts by key.
 
-    The key of the only part of an observation that is not mixed is empty.
+    An observation that is not mixed has one part, with the key "".
     """
     if not dtype.names:
         return {"": (dtype, shape)}
@@ -52,7 +53,7 @@ def fields_of(shape: Shape, dtype: DType) -> Fields:
 
 
 def values_in(shape: Shape, dtype: DType) -> int:
-    """Return how many values an observation has, bytes of pictures and numbers."""
+    """Return how many values an observation has, where a value is a byte of a picture or a number."""
     sizes = 0
     for _, size in fields_of(shape, dtype).values():
         sizes += prod(size)
@@ -60,7 +61,10 @@ def values_in(shape: Shape, dtype: DType) -> int:
 
 
 def mixed_type(fields: Fields) -> DType:
-    """Return the type of observations with these parts, sorted by key. Raises ``ValueError`` if parts are malformed."""
+    """Return the type of mixed observations with the parts ``fields``, sorted by key.
+
+    Raises ``ValueError`` if a key cannot be a file name, or if a part has no values.
+    """
     sizes = [min(shape, default=0) for _, shape in fields.values()]
     are_plain = plain_names([*fields])
     if not are_plain or min(sizes) <= 0:
@@ -78,7 +82,7 @@ def type_text(dtype: DType) -> str:
 
 
 def type_of(text: str) -> DType:
-    """Return the type that :func:`type_text` wrote as ``text``. Raises ``ValueError`` if the text is anything else."""
+    """Return the type that :func:`type_text` wrote. Raises ``ValueError`` for any other text."""
     if text in KINDS:
         return KINDS[text]
     fields = {}
@@ -91,9 +95,9 @@ def type_of(text: str) -> DType:
 
 
 def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations:
-    """Return mixed observations (N,) made from arrays (N, ...) by key.
+    """Return mixed observations (N,) made of arrays (N, ...) by key.
 
-    Raises ``ValueError`` if their lengths differ, or if their type is not ``dtype``, if given.
+    Raises ``ValueError`` if the arrays differ in N, or if they do not have the type ``dtype``, where it is given.
     """
     arrays = {}
     fields = {}
@@ -115,7 +119,7 @@ def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations
 
 
 def numbers_of(observations: Observations) -> Floats:
-    """Return all numbers of observations (N, ...), a row for each, float32 (N, D)."""
+    """Return all numbers of observations (N, ...), without their pictures, float32 (N, D)."""
     count = len(observations)
     fields = fields_of(observations.shape[1:], observations.dtype)
     rows = [np.zeros((count, 0), NUMBERS)]
@@ -128,9 +132,9 @@ def numbers_of(observations: Observations) -> Floats:
 
 
 def standard_of(shape: Shape, *observations: Observations) -> Standard:
-    """Return mean and deviation (*shape) of numbers (N, *shape).
+    """Return the mean and the deviation of numbers (N, *shape), float32 (*shape) each.
 
-    The deviation is 1 where numbers hardly vary, and without any numbers.
+    The deviation is 1 where the numbers hardly vary. Without ``observations`` the mean is 0, and the deviation is 1.
     """
     rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
     nothing = np.zeros((1, *shape), NUMBERS)
@@ -143,12 +147,12 @@ def standard_of(shape: Shape, *observations: Observations) -> Standard:
 
 
 def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
-    """Return numbers (N, *shape), arrays or tensors, in deviations from their mean (*shape)."""
+    """Return numbers (N, *shape) in deviations (*shape) from their mean (*shape). All are arrays, or all tensors."""
     deviations = (observations - mean) / deviation
     return deviations.clip(-DEVIATIONS, DEVIATIONS)
 
 
 def spread_rows(count: int, most: int) -> Ints:
-    """Return all rows of ``count``, or ``most`` rows spread evenly, int64 (n,)."""
+    """Return the numbers of all ``count`` rows, or of ``most`` rows spread evenly over them, int64 (n,)."""
     wanted = min(count, most)
     return np.linspace(0, count - 1, wanted, dtype=int)
