@@ -378,8 +378,8 @@ def _mean(rows: list[dict[str, str]], quantity: str) -> str:
 
 
 def _steps(rows: list[dict[str, str]]) -> str:
-    """The median steps to 95 of 100 episodes, practice included; never where most do not arrive."""
-    values = [float(row["steps_to_95"] or "inf") + float(row["practised"]) for row in rows]
+    """The median steps to 95 of 100 episodes, which count from the first step of practice; never if most do not arrive."""
+    values = [float(row["steps_to_95"] or "inf") for row in rows]
     median = np.median(values)
     return "never" if np.isinf(median) else f"{median:,.0f}"
 
