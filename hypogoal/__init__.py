@@ -1,7 +1,8 @@
 """hypogoal: transferable sub-goals by hypothesising which features generalise.
 
-Its environments are registered with Gymnasium if that was imported before, else by :mod:`hypogoal.envs`. Heavy parts
-(torch, the environments' modules) are imported on first use, so that ``import hypogoal`` and ``--help`` stay fast.
+If Gymnasium was imported before, hypogoal's environments are registered with it now, otherwise by :mod:`hypogoal.envs`.
+Heavy parts (torch, the environments' modules) are imported on first use, so that ``import hypogoal`` and ``--help``
+stay fast.
 """
 
 import importlib
@@ -10,7 +11,7 @@ from typing import Any
 
 __version__ = "1.1.0"
 
-_HOMES = {  # where each name is imported from on first use; __init__.pyi has their signatures, for editors
+_HOMES = {  # where each name is imported from on first use; __init__.pyi has the signatures, for editors
     "GymnasiumDomain": "domains.gymnasium.domain",
     "Made": "look",
     "OptionEnv": "options.env",
@@ -46,5 +47,5 @@ def __dir__() -> list[str]:
 
 
 if "gymnasium" in sys.modules:
-    # Not otherwise: importing Gymnasium takes longer than the rest of this package.
+    # Only then, because importing Gymnasium takes longer than the rest of this package.
     importlib.import_module("hypogoal.envs")

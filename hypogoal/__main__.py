@@ -1,10 +1,10 @@
-"""``python -m hypogoal``, and what the command ``hypogoal`` runs."""
+"""What ``python -m hypogoal`` and the command ``hypogoal`` run."""
 
 import signal
 import sys
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    # During imports Ctrl-C just ends the process; a handler would print a page of traceback.
+    # During imports Ctrl-C ends the process, because Python's own handler would print a page of traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from hypogoal.cli import main

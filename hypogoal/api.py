@@ -2,7 +2,7 @@
 
 The functions of the stages do what their commands do, see :mod:`hypogoal.command.stage`. They take ``out``, a command's
 options (``preset``, ``seed``, ``device``, ``force``, ``resume``, ``quiet``, inputs such as ``options``) and any setting
-by name. What would end a command is a ``UserError``.
+by name. They raise ``UserError`` where a command would end with an error.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ from hypogoal.options.termination import saved_rule
 
 
 def compare(*runs: Place, out: Place, force: bool = False) -> Made:
-    """Compare each evaluated run with the first. The result shows which wins, by how much, on what."""
+    """Compare each evaluated run with the first. The result shows which run wins, by how much, on what."""
     from hypogoal.tools.compare import compare as compared
 
     return compared(runs, out, force=force)
@@ -28,7 +28,7 @@ def compare(*runs: Place, out: Place, force: bool = False) -> Made:
 
 @own_settings()
 def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
-    """The hypotheses of one sub-goal.
+    """Return the hypotheses of one sub-goal.
 
     Args:
         path: an ensemble artefact's folder.
@@ -39,7 +39,7 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
         and returns float32 (N, K).
 
     Raises:
-        UserError: not an ensemble artefact, or no such sub-goal.
+        UserError: if ``path`` is no ensemble artefact, or has no such sub-goal.
 
     >>> import numpy, hypogoal
     >>> ensemble = hypogoal.load_ensemble("runs/demo/ensemble", "open-red-door")
@@ -54,14 +54,15 @@ def load_ensemble(path: str | Path, sub_goal: str) -> Ensemble:
 
 @own_settings()
 def load_options(path: str | Path, ensemble: str | Path | None = None) -> Options:
-    """The options of an options or meta artefact: policies and termination classifiers.
+    """Return the options of an options or meta artefact: policies and termination classifiers.
 
     Args:
         path: the artefact's folder.
-        ensemble: the ensemble artefact they were trained with; None: the one in the manifest.
+        ensemble: the ensemble artefact with which the options were trained; None: the ensemble in the manifest.
 
     Raises:
-        UserError: not such an artefact, the ensemble is gone, or the options end at the true sub-goals (oracle).
+        UserError: if ``path`` is no such artefact, if the ensemble is gone, or if the options end at the true sub-goals
+            (oracle).
 
     >>> import hypogoal
     >>> options = hypogoal.load_options("runs/demo/meta")

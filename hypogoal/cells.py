@@ -1,7 +1,7 @@
-"""The cells of a run: a cell is one command of hypogoal with an output of its own.
+"""The cells of a run. A cell is one command of hypogoal, with its own output.
 
 The plan is ``sweep.json``. A cell is done when its output is there, runs while its draft is locked, and has failed if
-its last attempt did (``logs/NAME.code``). Nothing else is recorded: a run may be killed and started again anywhere.
+its last attempt did (``logs/NAME.code``). Nothing else is recorded, so a run may be killed and started again anywhere.
 """
 
 from pathlib import Path
@@ -13,10 +13,10 @@ from hypogoal.core.checkpoints import ANEW
 from hypogoal.core.files import reading
 
 PLAN = "sweep.json"
-NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # of a cell: its place in the run's folder
-HERE = "{run}"  # in a cell's words the run's folder
+NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # names of cells, which are places in the run's folder
+HERE = "{run}"  # stands for the run's folder in a cell's words
 DONE, RUNNING, FAILED, WAITING = "done", "running", "failed", "waiting"
-STOPPED = ("", "130", "143", "-2", "-15")  # exit codes that are no failure: none yet, Ctrl-C, SIGTERM
+STOPPED = ("", "130", "143", "-2", "-15")  # exit codes that are no failure: none yet, Ctrl-C, SIGTERM, or their signals
 COLUMNS = ["cell", "sub_goal", "member", "scope", "quantity", "value"]
 
 Value = str | int | float
@@ -27,65 +27,68 @@ class Cell(BaseModel):
 
     name: str = Field(pattern=NAME)
     words: list[str]
-    needs: list[str] = []  # places of the outputs that it reads
-    after: list[str] = []  # places of outputs that have this machine's cores before it
-    columns: dict[str, Value] = {}  # of ``results.csv``
-    run: Path = Field(Path(), exclude=True)  # not in the plan: the folder may be moved
+    needs: list[str] = []  # places of the outputs that the cell reads
+    after: list[str] = []  # places of outputs whose cells get this machine's cores first
+    columns: dict[str, Value] = {}  # columns of ``results.csv``
+    run: Path = Field(Path(), exclude=True)  # not in the plan, because the folder may be moved
 
     @property
     def stage(self) -> str:
-        """Its command: train-meta, ..."""
+        """The name of the cell's command, such as train-meta."""
         return self.words[0]
 
     @property
     def is_derived(self) -> bool:
-        """Whether it only reads the run and is made again in minutes."""
+        """Whether the cell only reads the run, and is made again in minutes."""
         return self.stage in ("evaluate", "report")
 
     @property
     def place(self) -> str:
-        """Its output in the run's folder."""
+        """The place of the cell's output in the run's folder."""
         return f"{self.name}.h5" if self.stage == "collect" else self.name
 
     @property
     def out(self) -> Path:
-        """Its output."""
+        """The path of the cell's output."""
         return self.run / self.place
 
     @property
     def draft(self) -> Draft:
-        """The draft of its output."""
+        """The draft of the cell's output."""
         return Draft(self.out)
 
     @property
     def is_done(self) -> bool:
-        """Whether its output is there."""
+        """Whether the cell's output is there."""
         return self.out.exists()
 
     @property
     def is_makeable(self) -> bool:
-        """Whether it can be made: all that it reads is there."""
+        """Whether the cell is not done, and all that it reads is there."""
         return not self.is_done and all((self.run / need).exists() for need in self.needs)
 
     @property
     def command(self) -> list[str]:
-        """Its words as one types them after ``hypogoal``."""
+        """The cell's words, as one types them after ``hypogoal``."""
         words = [*self.words, "--out", str(self.out)]
         return [word.replace(HERE, str(self.run)) for word in words]
 
     def log(self, suffix: str = "log") -> Path:
-        """What its attempts printed; with the suffix ``code`` how the last one ended, a signal as a negative number."""
+        """Return the path of what the cell's attempts printed.
+
+        With the suffix ``code``, the file says how the last attempt ended, a signal as a negative number.
+        """
         return self.run / "logs" / f"{self.name}.{suffix}"
 
     def last_line(self, suffix: str = "log") -> str:
-        """The last line of :meth:`log`, empty where there is none."""
+        """Return the last line of the file :meth:`log`, or an empty text if there is none."""
         path = self.log(suffix)
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
         return lines[-1] if lines else ""
 
     @property
     def state(self) -> str:
-        """Whether it is done, runs, failed or waits."""
+        """Whether the cell is done, runs, failed or waits."""
         if self.is_done:
             return DONE
         if self.draft.is_locked:
@@ -94,7 +97,10 @@ class Cell(BaseModel):
 
     @property
     def last_words(self) -> str:
-        """The last line of its log, or the signal that ended it; and where the log is. Its advice is that of a run."""
+        """The last line of the cell's log, or the signal that ended the cell, and where the log is.
+
+        If the line gives advice for a single command, the advice is replaced by that for a run.
+        """
         code = self.last_line("code")
         text = f"ended by signal {code[1:]}" if code.startswith("-") else self.last_line()
         text = text.replace(ANEW, f"Give --from {self.stage} and no --resume to make that stage anew.")
@@ -105,7 +111,10 @@ CELLS = TypeAdapter(list[Cell])
 
 
 def read_plan(run: Path) -> list[Cell]:
-    """The cells of a run, none if no experiment was begun there; a damaged plan is a ``UserError``."""
+    """Return the cells of a run. If no experiment was begun there, the list is empty.
+
+    Raises ``UserError`` if the plan is damaged.
+    """
     path = run / PLAN
     if not path.exists():
         return []
@@ -115,12 +124,12 @@ def read_plan(run: Path) -> list[Cell]:
 
 
 def unmade(run: Path) -> list[str]:
-    """The names of the cells that a run was to have and has not."""
+    """Return the names of the cells that a run was to have and does not have."""
     return [cell.name for cell in read_plan(run) if not (cell.is_derived or cell.is_done)]
 
 
 def write_results(run: Path, evaluation: Path) -> None:
-    """Write ``results.csv`` beside an evaluation's ``numbers.csv``: each of its numbers with its cell's columns.
+    """Write ``results.csv`` beside an evaluation's ``numbers.csv``: numbers with the columns of their cell.
 
     Learning curves are in ``numbers.csv`` alone.
     """
@@ -138,7 +147,10 @@ def write_results(run: Path, evaluation: Path) -> None:
 
 
 def status_lines(run: Path) -> list[str]:
-    """How far a run is: a line of numbers, then what runs or failed with the last line of its log; done: none."""
+    """Return a line on how far a run is, and a line for each cell that runs or failed, with its log's last line.
+
+    The list is empty if the run is done.
+    """
     cells = read_plan(run)
     states = [cell.state for cell in cells]
     left = [state for state in (RUNNING, FAILED, WAITING) if state in states]

@@ -1,7 +1,7 @@
-"""The command line: each command parses, calls one function and prints; its last line is the path of what it made.
+"""The command line. A command parses, calls one function and prints; its last line is the path of what it made.
 
-The stages' commands come from the stages, see :mod:`hypogoal.command`. Heavy imports are inside commands,
-so that ``hypogoal --help`` is quick.
+The stages' commands come from the stages, see :mod:`hypogoal.command`. Heavy imports are inside commands, so that
+``hypogoal --help`` is quick.
 """
 
 import functools
@@ -28,7 +28,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
 
 MAKE = "Make"  # a group of commands
-WIDTH = 100  # of tables
+WIDTH = 100  # columns of tables
 EXPERIMENTS = (
     "doorkey, choosing, montezuma-ladders, rooms, figure3, figure4, figure6, or one of your own: a .toml file or "
     "module:function."
@@ -36,7 +36,7 @@ EXPERIMENTS = (
 
 
 class Commands(TyperGroup):
-    """The commands; those of stages are made when they are called, since their settings take time to load."""
+    """The commands. Those of stages are made when they are called, since their settings take time to load."""
 
     def resolve_command(self, context: Any, words: list[str]) -> Any:
         name, *rest = words
@@ -60,7 +60,7 @@ Json = Annotated[bool, Option("--json", metavar="", help="Print JSON for program
 
 
 def command(panel: str, example: str, name: str | None = None) -> Any:
-    """Make a function a command of a group; its ``--help`` ends with an example."""
+    """Return a decorator that makes a function a command of a group. The command's ``--help`` ends with an example."""
     return app.command(name, rich_help_panel=panel, epilog=f"Example:\n\n[bold]hypogoal {example}[/bold]")
 
 
@@ -86,9 +86,9 @@ def _root(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code: 2 for the user's mistakes, 1 for hypogoal's."""
+    """Run the command line. Return the exit code: 2 for the user's mistakes, 1 for hypogoal's."""
     if arguments is None:
-        signal.signal(signal.SIGTERM, processes.stop)  # a cancelled job, too, leaves nothing half-written
+        signal.signal(signal.SIGTERM, processes.stop)  # so that a cancelled job leaves nothing half-written
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in the background
             signal.signal(signal.SIGINT, processes.stop)
         warnings.formatwarning = lambda message, *_: f"hypogoal: {message}\n"
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     own_code.allow(words)
     try:
         return _called([word for word in words if word not in ("--debug", own_code.TRUST)])
-    except BrokenPipeError:  # whoever read what was printed, such as head, has enough
+    except BrokenPipeError:  # a program that read what was printed, such as head, has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at its exit
         return 1
     except KeyboardInterrupt as stop:
@@ -111,18 +111,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @functools.cache
 def _commands() -> Any:
-    """Typer's commands, built once per process: building takes longer than many commands."""
+    """Return Typer's commands, built once per process, because building takes longer than many commands."""
     return typer.main.get_command(app)
 
 
 def commands() -> dict[str, Any]:
-    """Every command by name, those of stages loaded."""
+    """Return every command by name, with those of stages loaded."""
     of_stages = {name: stage.load_stage(name).command for name in stage.LISTED}
     return _commands().commands | of_stages
 
 
 def _called(words: list[str]) -> int:
-    """Run a command; Ctrl-C and errors pass, but for those of the words themselves."""
+    """Run a command, and return its exit code.
+
+    Ctrl-C and errors are passed on, except errors in the words themselves.
+    """
     if "_HYPOGOAL_COMPLETE" in os.environ:  # the shell asks for completions
         _commands()(args=words, prog_name="hypogoal")
     try:
@@ -137,7 +140,7 @@ def _called(words: list[str]) -> int:
 
 
 def _advice(error: Any) -> str:
-    """What to do about words that a command does not take; settings are often mistaken for options."""
+    """Return what to do about words that a command does not take. Settings are often mistaken for options."""
     from hypogoal.core.config import STAGES
 
     stage = error.ctx.info_name
@@ -148,7 +151,7 @@ def _advice(error: Any) -> str:
 
 
 def _fail(message: str, code: int, error: BaseException | None = None) -> int:
-    """Say what is wrong, and the notes that were added to the error."""
+    """Print what is wrong, with the notes that were added to the error. Return ``code``."""
     notes = getattr(error, "__notes__", [])
     if notes:
         message = "; ".join([message.rstrip("."), *notes])
@@ -200,7 +203,7 @@ def run(
         for cell in runs.in_part(cells, from_, only):
             say(shlex.join(["hypogoal", *cell.command]))
         return
-    if engine == "local" and device == "cuda":  # with Slurm another machine's device is meant
+    if engine == "local" and device == "cuda":  # with Slurm, the device is another machine's
         processes.prepare(device)
     if engine == "local" and not quiet:
         say(f"Each line names what one command makes in {out}.", err=True)
@@ -289,7 +292,7 @@ def config(
 
 
 def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
-    """Settings under the parts that they belong to; a range such as 0-9 or a command stays in one piece."""
+    """Yield settings under the parts that they belong to. A range such as 0-9, or a command, stays in one piece."""
     width = min(shutil.get_terminal_size().columns, WIDTH)
     wrapped = textwrap.TextWrapper(width, " " * 6, " " * 6, break_on_hyphens=False, break_long_words=False)
     for part, settings in itertools.groupby(rows, lambda row: row["part"]):
@@ -304,7 +307,7 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
             yield from wrapped.wrap(f"{row['meaning']}{allowed}{source}")
 
 
-for _stage, _help in stage.LISTED.items():  # their commands come from them
+for _stage, _help in stage.LISTED.items():  # for --help alone; the commands are made when they are called
     app.command(_stage, help=_help, rich_help_panel=stage.TOOLS.get(_stage, MAKE))(lambda: None)
 
 

@@ -1,9 +1,10 @@
-"""The HDF5 file of collected states: labelled, unlabelled, held-out.
+"""The HDF5 file of collected states, which are labelled, unlabelled or held out.
 
-``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations``, ``heldout/<sub-goal>/{observations,labels}``
-and, beside each, ``origin/*`` per state. Sub-goals with the same states share one dataset on disk (hard links). The
-root's attributes hold format version, domain, observation space, arguments and versions. ``complete`` is set last, so a
-file without it was cut off.
+The file has the datasets ``labelled/<sub-goal>/{observations,labels}``, ``unlabelled/observations`` and
+``heldout/<sub-goal>/{observations,labels}``. Beside the observations, ``origin/*`` has a number for each state.
+Sub-goals with the same states share one dataset on disk (hard links). The root's attributes are the version of the
+format, the domain, the observation space, the arguments and the versions. The attribute ``complete`` becomes true last,
+so a file in which it is false was cut off.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ from hypogoal.observations import (
     type_text,
 )
 
-DATA_FORMAT = 2  # 1: texts of variable length
+DATA_FORMAT = 2  # in format 1 texts had variable length
 SPLITS = ("labelled", "heldout")
 RECOLLECT = "Collect it again."
 ANEW = "Bring all files that it is made of, or write it again, whole."
 GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
-GROUP = "group"  # an origin: states of a group are held out together, to choose a weight by
-PLANTED = "planted_"  # begins the names of origins that say whether a state has a feature
-FEW = 10  # warn below this number of labelled states of a class
-RARE = 0.05  # warn below this share of a class
-COLUMN_CHUNK = 1 << 16  # values of a label or origin
+GROUP = "group"  # an origin; to choose a weight, the states of a group are held out together
+PLANTED = "planted_"  # the beginning of the names of origins that say whether a state has a feature
+FEW = 10  # with fewer labelled states of a class, a warning is given
+RARE = 0.05  # with a smaller share of a class among the labelled states, a warning is given
+COLUMN_CHUNK = 1 << 16  # values of labels or of an origin in a chunk
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ class States:
 
     Attributes:
         observations: uint8 or float32 (N, *observation_shape), or mixed (N,).
-        labels: bool (N, G), one column per sub-goal; (N,) for a single sub-goal.
-        origins: int (N,) arrays by name, where each state comes from (layout_seed, agent_x, ...).
+        labels: bool (N, G), one column per sub-goal, or (N,) for a single sub-goal.
+        origins: by name, int (N,), where each state comes from (layout_seed, agent_x, ...).
     """
 
     observations: Observations
@@ -63,7 +64,7 @@ class States:
     origins: Mapping[str, Ints] = field(default_factory=dict)
 
     def where(self, kept: Array) -> States:
-        """The states that are ``kept``, bool (N,), or the rows of some, int (M,)."""
+        """Return the states that ``kept`` names, either a mask, bool (N,), or their rows, int (M,)."""
         origins = {name: values[kept] for name, values in self.origins.items()}
         observations = self.observations[kept]
         return States(observations, self.labels[kept], origins)
@@ -71,10 +72,15 @@ class States:
 
 @dataclass(frozen=True)
 class Collected:
-    """What a domain's ``collect`` returns: three sets of states, the names of sub-goals (G) and of features, if any.
+    """What a domain's ``collect`` returns.
 
-    ``channels`` says of each key's pictures, "" of those without, how many frames of how many colours their channels
-    are; it is empty if nobody said so.
+    Attributes:
+        observation_shape: the shape of one observation.
+        sub_goals: the names of the sub-goals (G).
+        labelled, unlabelled, heldout: the three sets of states.
+        features: the names of an observation's numbers, or empty if they have no names.
+        channels: for stacked pictures, how many frames of how many colours their channels are, by key. The key of an
+            observation that is not mixed is "".
     """
 
     observation_shape: Shape
@@ -83,22 +89,22 @@ class Collected:
     unlabelled: States
     heldout: States
     features: tuple[str, ...] = ()
-    channels: Mapping[str, Sequence[int]] = field(default_factory=dict)  # frames and colours of stacks, by key
+    channels: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
 
 class Unmet(UserError):
-    """Play did not reach the states needed."""
+    """An error because play did not reach the states needed."""
 
 
 def leave_out(states: States, *training: Observations) -> States:
-    """The states without those that look like one of ``training``, observations (M, ...) each."""
+    """Return the states whose observations are in none of the sets ``training``, of observations (M, ...) each."""
     digests = set(map(digest, chain(*training)))
     apart = [digest(observation) not in digests for observation in states.observations]
     return states.where(np.array(apart, bool))
 
 
 def joined(parts: Sequence[States]) -> States:
-    """The states of all parts, with the origins that all of them have."""
+    """Return the states of all parts as one set, with the origins that all parts have."""
     if len(parts) == 1:
         return parts[0]
     observations = np.concatenate([part.observations for part in parts])
@@ -111,9 +117,10 @@ def joined(parts: Sequence[States]) -> States:
 
 
 def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str]:
-    """A line for each sub-goal with few labelled states of a class, or one class only among the held-out states.
+    """Return a line for each doubt whether the labels suffice.
 
-    Labels are (N, G) and (M, G).
+    A sub-goal is in doubt if a class has few labelled states, or if the held-out states are of one class only.
+    ``labelled`` (N, G) and ``heldout`` (M, G) are labels.
     """
     lines = []
     for goal, column, judged in zip(goals, labelled.T, heldout.T, strict=True):
@@ -126,7 +133,10 @@ def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str
 
 
 def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str) -> None:
-    """Refuse (``Unmet``) labels (N, G) of labelled states that have one class only for some sub-goal."""
+    """Raise ``Unmet`` if the labels (N, G) of labelled states are of one class only for a sub-goal.
+
+    ``where`` and ``do`` are parts of the error.
+    """
     for goal, column in zip(goals, labels.T, strict=True):
         if len(np.unique(column)) < 2:
             lacking = "negatives" if column.any() else "positives"
@@ -134,7 +144,7 @@ def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str)
 
 
 def require_names(sub_goals: Sequence[str]) -> None:
-    """Refuse (``UserError``) an empty list, names that are not plain, and names that differ only in case."""
+    """Raise ``UserError`` if there are no names, if a name is not plain, or if two names differ only in case."""
     if not plain_names(sub_goals):
         do = f"Give one or more, different even if case is ignored, without separators and {' '.join(NO_FILE_NAME)}"
         raise UserError("sub-goals need different names that are usable as file names", ", ".join(sub_goals), f"{do}.")
@@ -142,7 +152,7 @@ def require_names(sub_goals: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> Iterator[Any]:
-    """An HDF5 file opened for reading; whatever cannot be read in the block is a ``UserError``."""
+    """Open an HDF5 file for reading. Raises ``UserError`` if anything cannot be read within the context."""
     import h5py
 
     with reading(path, do, subject), h5py.File(path, "r", locking="best-effort") as file:
@@ -151,10 +161,10 @@ def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> I
 
 @contextlib.contextmanager
 def create_hdf5(path: Path) -> Iterator[Any]:
-    """A fresh HDF5 file to fill, built in memory and written when the block ends.
+    """Give a new HDF5 file, which is built in memory and written when the context ends.
 
-    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16); writing the finished bytes
-    ourselves raises a normal ``OSError``.
+    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16), but writing the finished
+    bytes ourselves raises a normal ``OSError``.
     """
     import h5py
 
@@ -167,9 +177,10 @@ def create_hdf5(path: Path) -> Iterator[Any]:
 
 
 def whole(data: Any) -> Any:
-    """An HDF5 dataset all of whose values are stored, else a ``UserError``: HDF5 reads others for those that are not.
+    """Return the HDF5 dataset ``data``. Raises ``UserError`` if some of its values are not stored.
 
-    Chunks and arrays may never have been written, raw files and parts of a virtual dataset may be gone.
+    HDF5 reads other values in place of those that are not stored. Values are not stored where chunks or arrays were
+    never written, or where raw files or parts of a virtual dataset are gone.
     """
     is_whole = data.id.get_storage_size() > 0 or not data.size
     if data.chunks:
@@ -185,7 +196,7 @@ def whole(data: Any) -> Any:
 
 
 def _is_covered(data: Any) -> bool:
-    """Whether the parts of a virtual dataset, which must be whole, leave no gap in it."""
+    """Return whether the parts of a virtual dataset leave no gap in it. Raises ``UserError`` if a part lacks values."""
     import h5py
 
     whole_file = Path(data.file.filename)
@@ -201,7 +212,10 @@ def _is_covered(data: Any) -> bool:
 
 
 def fixed(text: str) -> Array:
-    """A text as a fixed-length UTF-8 string, stored in place; variable-length ones lie in HDF5's global heap."""
+    """Return a text as a UTF-8 string of fixed length.
+
+    HDF5 stores a string of fixed length in place, but a string of variable length in its global heap.
+    """
     import h5py
 
     data = text.encode()
@@ -216,9 +230,9 @@ def write_dataset(
     config: Mapping[str, Any],
     seed: int,
 ) -> None:
-    """Write collected states; a file of that name is replaced once the new one is complete.
+    """Write collected states to ``path``. An earlier file there is replaced once the new file is complete.
 
-    Raises ``UserError`` if a name cannot be a file name, labels are not truth values or numbers not finite.
+    Raises ``UserError`` if a name cannot be a file name, if labels are not truth values, or if numbers are not finite.
     """
     require_names(collected.sub_goals)
     attributes = {
@@ -247,7 +261,7 @@ def write_dataset(
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]) -> None:
-    """A group for each sub-goal; the same states are stored once, with a hard link in each group."""
+    """Write a group for each sub-goal. The states are stored once, with a hard link in each group."""
     labels = np.asarray(states.labels)
     if labels.dtype != bool:  # NumPy turns the text 'False' into True
         raise UserError(f"the domain's {split} labels are not truth values", labels.dtype, "Give bool (N, sub-goals).")
@@ -273,7 +287,7 @@ def _write_states(group: Any, states: States) -> None:
 
 
 def _store(group: Any, name: str, values: Array) -> None:
-    """Write observations compressed, other values with checksums: a flipped label would still be valid."""
+    """Write observations compressed, and other values with checksums, because a flipped label would still be valid."""
     filters = {}
     count = len(values)
     if count and name == "observations":
@@ -287,7 +301,7 @@ def _store(group: Any, name: str, values: Array) -> None:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A complete data file, of which states are read when asked for. Use :func:`open_dataset`."""
+    """A complete data file, from which states are read when they are asked for. Use :func:`open_dataset`."""
 
     path: Path
     domain: str
@@ -300,13 +314,14 @@ class Dataset:
 
     @property
     def observation_bytes(self) -> int:
-        """Of one observation."""
+        """The size of one observation in bytes."""
         return prod(self.observation_shape) * self.observation_dtype.itemsize
 
     def features(self) -> list[str]:
-        """The names of an observation's numbers, in order: the file's own, else ``x[0]``, ``x[1]``, ...
+        """Return the names of an observation's numbers, in order.
 
-        Of a mixed observation ``key[0]``, ``key[1]``, ..., and a picture's key alone.
+        If the file has no names, they are ``x[0]``, ``x[1]``, ... For a mixed observation they are ``key[0]``,
+        ``key[1]``, ..., but a picture or a single number has its key alone.
         """
         with opened(self.path) as file:
             if "features" in file:
@@ -319,28 +334,28 @@ class Dataset:
         return names
 
     def labelled(self, sub_goal: str) -> States:
-        """The labelled states of one sub-goal."""
+        """Return the labelled states of one sub-goal."""
         return self._states("labelled", sub_goal)
 
     def heldout(self, sub_goal: str) -> States:
-        """The held-out states of one sub-goal with their true labels, for evaluation only."""
+        """Return the held-out states of one sub-goal with their true labels, which are for evaluation only."""
         return self._states("heldout", sub_goal)
 
     def all_heldout(self) -> dict[str, States]:
-        """The held-out states of every sub-goal; one array of those that the file holds once."""
+        """Return the held-out states by sub-goal. Observations that the file holds once are one array."""
         read: dict[int, Observations] = {}
         return {sub_goal: self._states("heldout", sub_goal, read) for sub_goal in self.sub_goals}
 
     def unlabelled(self) -> Observations:
-        """The unlabelled states: uint8 or float32 (M, *obs)."""
+        """Return the observations of the unlabelled states, (M, *observation_shape)."""
         return self.unlabelled_states().observations
 
     def unlabelled_states(self) -> States:
-        """The same with their origins, if the file has any, and no labels, (M, 0)."""
+        """Return the unlabelled states with their origins, if the file has any. Their labels are empty, (M, 0)."""
         return self._states("unlabelled")
 
     def counts(self) -> dict[str, Any]:
-        """Numbers of states and positives, without reading the observations."""
+        """Count the states of each set, and the positives among them by sub-goal, without reading the observations."""
         with opened(self.path) as file:
             counts: dict[str, Any] = {"unlabelled": len(file["unlabelled/observations"])}
             for split in SPLITS:
@@ -351,9 +366,9 @@ class Dataset:
             return counts
 
     def _states(self, split: str, sub_goal: str = "", read: dict[int, Observations] | None = None) -> States:
-        """The states of a split; what is not as the root's attributes say is a ``UserError``.
+        """Return the states of a split. Raises ``UserError`` if they are not as the root's attributes say.
 
-        ``read``, by where they lie in the file: observations that need not be read again.
+        ``read`` are the observations that were read already, by their place in the file.
         """
         import h5py
 
@@ -383,13 +398,13 @@ class Dataset:
 
 
 def _plain(attribute: Any) -> Any:
-    """An attribute as Python's own: a text, int, float or bool."""
+    """Return an attribute as a Python str, int, float or bool."""
     value = np.asarray(attribute).item()
     return value.decode() if isinstance(value, bytes) else value
 
 
 def _column(group: Any, name: str) -> Array:
-    """One value for each state of a group."""
+    """Return the values of a dataset that has one value for each state of a group, (N,)."""
     values, states = whole(group[name])[()], len(group["observations"])
     if values.shape != (states,):
         raise ValueError(f"{group.name}/{name} of shape {values.shape} for {states} states")
@@ -397,7 +412,7 @@ def _column(group: Any, name: str) -> Array:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Open a data file written by ``collect``, or by the user in the same schema; else a ``UserError``."""
+    """Open a data file that ``collect`` wrote, or the user in the same schema. Raises ``UserError`` for other files."""
     with opened(path) as file:
         attributes = {name: _plain(value) for name, value in file.attrs.items()}
         version = attributes.get("format")

@@ -1,7 +1,7 @@
-"""Register the environments with Gymnasium: ``gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0")``.
+"""Registration of the environments with Gymnasium: ``gymnasium.make("hypogoal.envs:hypogoal/DoorKey-8x8-v0")``.
 
-Their modules are loaded when one is made. Since 1.0 Gymnasium asks no entry points of installed packages: who wants an
-environment imports a package, or names a module before the id.
+An environment's module is loaded when the environment is made. Since 1.0 Gymnasium asks no entry points of installed
+packages. So a user who wants an environment imports a package, or names a module before the id.
 """
 
 from gymnasium import register

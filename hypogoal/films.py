@@ -21,34 +21,34 @@ if TYPE_CHECKING:
     from hypogoal.meta.episodes import Frame
 
 NEEDED = "Videos need a meta artefact with learned terminations: train-meta."
-MOST_FRAMES = 200  # played for the page's film, till an episode has members that differ
-SIDE = 336  # pixels that a moving state is enlarged to, or a little less
-LINE, MARGIN, BAR, FONT = 18, 8, 8, 13  # pixels below it
+MOST_FRAMES = 200  # frames that are played at most to find an episode whose members differ
+SIDE = 336  # pixels to which a state is enlarged, or a little less
+LINE, MARGIN, BAR, FONT = 18, 8, 8, 13  # pixels below the state
 STEP, PAUSE, END, LAST = 140, 500, 600, 1_500  # milliseconds: a step, members differ, an option's end, the last frame
 SHADES = 48  # colours of a film
-FAINT = "#a2a9b2"  # on the ink of a film it can be read
+FAINT = "#a2a9b2"  # readable on the ink of a film
 
 
 @dataclass(frozen=True)
 class Film:
-    """An episode of an agent."""
+    """A film of an agent's episode."""
 
-    name: str  # of its file
+    name: str  # the name of the file
     gif: bytes
-    about: dict[str, Any]  # what the page says of it
+    about: dict[str, Any]  # what the page says of the film
 
 
 def agent_to_film(run: Path) -> Artefact | None:
-    """The run's first agent that learned to choose among members' options."""
+    """Return the run's first agent that learned to choose among members' options, or None."""
     agents = [artefact for artefact in find_artefacts(run, "meta") if choice_of(artefact) == "learned"]
     return agents[0] if agents else None
 
 
 def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
-    """The first ``count`` episodes of an agent, whose ``path`` in the run names them.
+    """Return films of the first ``count`` episodes of an agent, named after ``path``, the agent's path in the run.
 
-    None: one, the first that :func:`_telling` finds within ``MOST_FRAMES``, else the first of all. Without pictures a
-    ``UserError``.
+    With ``count`` None, there is one film, of the first episode that :func:`_telling` finds within ``MOST_FRAMES`` or,
+    if there is none, of the first episode. Raises ``UserError`` if the agent does not see pictures.
     """
     from hypogoal.meta.episodes import agent_of, play_episode
 
@@ -76,9 +76,9 @@ def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
 
 
 def _telling(loop, members):
-    """The number and frames of the first episode in which the agent took the right one of members that differ.
+    """Return the number and frames of the first episode in which members differed and the agent took the right one.
 
-    The last option's own member ended it, solved.
+    It took the right one if the episode was solved, and the last option's own member ended that option.
     """
     from hypogoal.meta.episodes import SOLVED, play_episode
 
@@ -94,7 +94,7 @@ def _telling(loop, members):
 
 
 def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[str]:
-    """What is written below a frame: the option that runs, each member's prediction, and why the option ended."""
+    """Return the lines below a frame: the option that runs, each member's prediction, and why the option ended."""
     goal, running = divmod(frame.option, members)
     lines = [f"option: {sub_goals[goal]}"]
     for member, positive in enumerate(frame.predictions):
@@ -107,9 +107,10 @@ def frame_lines(frame: Frame, sub_goals: Sequence[str], members: int) -> list[st
 
 
 def draw_frame(frame: Frame, sub_goals: Sequence[str], members: int, timeout: int) -> Image.Image:
-    """A frame enlarged; a bar is as long as the steps that are left to the option, of ``timeout``.
+    """Draw a frame, enlarged, with a bar and lines below.
 
-    Option g*K + k is member k of sub-goal g, whose colour the bar has; who says 'reached' is written in white.
+    The bar is as long as the steps that are left to the option, of ``timeout``. Option g*K + k is member k of sub-goal
+    g, and the bar has the colour of the sub-goal. Members that say 'reached' are written in white.
     """
     state = Image.fromarray(coloured(frame.observation))
     state = ImageOps.scale(state, max(1, SIDE // max(state.size)), Image.Resampling.NEAREST)
@@ -134,9 +135,9 @@ def episode_gif(
     members: int,
     timeout: int,
 ) -> bytes:
-    """An episode as an animated GIF that plays over and over, 80 kB for 15 steps; frames (n,), n at least 1.
+    """Return an episode, frames (n,) with n at least 1, as an animated GIF that plays over and over.
 
-    It pauses where an option ends, and where its member comes to differ from others of its sub-goal.
+    The film pauses where an option ends, and where members of its sub-goal come to differ. 15 steps take 80 kB.
     """
     pictures, times = [], []
     before: tuple[bool, ...] = ()

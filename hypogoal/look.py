@@ -1,4 +1,4 @@
-"""What is there, is it whole, is it up to date: for ``show``, ``verify``, ``status`` and notebooks."""
+"""What is in a file, an artefact or a run, whether it is whole, and whether it is up to date."""
 
 import shlex
 import textwrap
@@ -16,16 +16,19 @@ from hypogoal.core.progress import say
 from hypogoal.data import SPLITS, open_dataset
 from hypogoal.observations import type_text
 
-WIDTH = 80  # columns
+WIDTH = 80  # columns of a line
 EVALUATION = "evaluation"
 SUMMARISED = {EVALUATION: "Evaluate the run again, with --force.", "comparison": "Compare the runs again."}
-# Of a training's log, in the order in which they are shown.
+# Numbers of a training's log, in the order in which they are shown.
 LOGGED = ("labelled", "success", "length", "reached", "terminated", "duration", "episodes")
 Details = dict[str, Any]  # a description
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The data files and artefacts at or below a path; a ``UserError`` if nothing is there or being made."""
+    """Return the data files and artefacts at or below a path.
+
+    Raises ``UserError`` if nothing is there, or being made.
+    """
     if path.is_file() or (path / MANIFEST).is_file():
         return [path]
     artefacts = [manifest.parent for manifest in visible(path, MANIFEST)]
@@ -37,7 +40,7 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def unfinished(path: Path) -> list[str]:
-    """A line for each output at or below a path that is being made, or was interrupted."""
+    """Return a line for each output at or below a path that is being made, or was interrupted."""
     lines = []
     drafts = sorted(path.rglob(".*.partial"))
     below = [folder.with_name(folder.name[1:].removesuffix(".partial")) for folder in drafts]
@@ -50,12 +53,12 @@ def unfinished(path: Path) -> list[str]:
 
 
 def in_the_making(path: Path) -> list[str]:
-    """A line for each output at or below a path that is not complete; of a run how far it is."""
+    """Return a line for each output at or below a path that is not complete. Of a run, return how far it is."""
     return status_lines(path) if read_plan(path) else unfinished(path)
 
 
 def describe(path: Path) -> Details:
-    """Kind, numbers, settings and inputs of a data file or an artefact; of a run those of all its parts."""
+    """Return kind, numbers, settings and inputs of a data file or an artefact. Of a run, return those of its parts."""
     parts = parts_of(path)
     if parts != [path]:
         return {"path": str(path), "kind": "run", "parts": [describe(part) for part in parts]}
@@ -74,7 +77,7 @@ def describe(path: Path) -> Details:
 
 
 def numbers_of(path: Path) -> Details:
-    """The last numbers in a training's log, means over sub-goals."""
+    """Return the last numbers in a training's log, as means over sub-goals."""
     last = {row.get("sub_goal"): row for row in read_log(path / LOG)}
     numbers = {}
     for name in LOGGED:
@@ -85,7 +88,7 @@ def numbers_of(path: Path) -> Details:
 
 
 def outcome(details: Details) -> list[str]:
-    """The numbers of what is described, as lines; of a run those of its evaluation."""
+    """Return the numbers of what is described, as lines. Those of a run are those of its evaluation."""
     kind, numbers = details["kind"], details.get("numbers", {})
     if kind == "run":
         evaluations = [outcome(part) for part in details["parts"] if part["kind"] == EVALUATION]
@@ -100,7 +103,7 @@ def outcome(details: Details) -> list[str]:
 
 
 def count_lines(counts: Details) -> list[str]:
-    """The numbers of states of a data file."""
+    """Return the numbers of states of a data file, as lines."""
     text = []
     for split in SPLITS:
         for goal, row in counts[split].items():
@@ -109,7 +112,10 @@ def count_lines(counts: Details) -> list[str]:
 
 
 def lines(details: Details) -> list[str]:
-    """What it is, a training's numbers, then how it was made, a fact a line; of a run a line for each part."""
+    """Return what is described, with a training's numbers, and then how it was made, a fact a line.
+
+    Of a run, return a line for each part.
+    """
     if details["kind"] == "run":
         return [lines(part)[0] for part in details["parts"]]
     facts = dict(details)
@@ -131,14 +137,14 @@ def lines(details: Details) -> list[str]:
 
 
 def _typed(value: Any) -> str:
-    """A value as one would type it."""
+    """Return a value as one would type it."""
     if isinstance(value, dict):
         value = [f"{name} {_typed(part)}" for name, part in value.items()]
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def faults(path: Path) -> list[str]:
-    """A line for each data file that cannot be read, and each file or input within that is missing or changed."""
+    """Return a line for each unreadable data file, and each file or input in ``path`` that is missing or changed."""
     lines = []
     for part in parts_of(path):
         try:
@@ -156,9 +162,10 @@ def faults(path: Path) -> list[str]:
 
 
 def stale(run: Path) -> list[Details]:
-    """The data files and artefacts of a run, inputs first.
+    """Return the data files and artefacts of a run, inputs first.
 
-    Of each its path, why it is stale (no reasons: it is up to date), and the command that made it.
+    Each has its path, the reasons why it is stale, and the command that made it. It is up to date if there are no
+    reasons.
     """
     reasons: dict[Path, list[str]] = {}
     parts = {part.resolve(): part for part in parts_of(run)}
@@ -173,7 +180,7 @@ def stale(run: Path) -> list[Details]:
 
 
 def _find_reasons(place: Path, reasons_of: dict[Path, list[str]]) -> list[str]:
-    """Why a data file or an artefact is stale; enters it in ``reasons_of``, after its inputs."""
+    """Return why a data file or an artefact is stale. Enter the reasons in ``reasons_of``, after its inputs'."""
     if place not in reasons_of:
         reasons = []
         if place.is_dir():
@@ -188,11 +195,11 @@ def _find_reasons(place: Path, reasons_of: dict[Path, list[str]]) -> list[str]:
 
 
 def stale_lines(rows: list[Details]) -> list[str]:
-    """What :func:`stale` found, as text."""
+    """Return what :func:`stale` found, as lines."""
     text = []
     for row in rows:
         text.append(f"{row['path']}: {'; '.join(row['reasons']) or 'up to date'}")
-        if row["command"].startswith("hypogoal "):  # a program cannot be given again
+        if row["command"].startswith("hypogoal "):  # the command of a user's program cannot be given again
             text.append(f"  {row['command']} --force")
     count = sum(bool(row["reasons"]) for row in rows)
     if rows:
@@ -211,7 +218,7 @@ class Made:
 
     @property
     def metrics(self) -> Any:
-        """Its numbers: counts of states or a training's last log entry, a dict; of an evaluation the DataFrame."""
+        """The numbers: a dict of counts of states or of a training's last log entry, or an evaluation's DataFrame."""
         table = self.path / "numbers.csv"
         if table.is_file():
             from hypogoal.evaluation.table import read_numbers

@@ -1,7 +1,8 @@
-"""What an observation is: a picture, numbers, or several of both by key; numbers in deviations from their mean.
+"""Observations: their shapes and types, and how numbers are standardised.
 
-Pictures are bytes (H, W, C). Numbers are float32 of any shape; networks see them standardised. Several of both are
-mixed: of shape (), and of a structured type with a field for each key.
+An observation is a picture, numbers, or mixed. Pictures are uint8 (H, W, C). Numbers are float32 of any shape, and
+networks see them in deviations from their mean. A mixed observation has several pictures and numbers by key. Its shape
+is (), and its type is a structured type with a field for each key.
 """
 
 import json
@@ -23,22 +24,25 @@ KINDS: dict[str, DType] = {
     "uint8": PICTURE,
     "float32": NUMBERS,
 }
-Observations = Array  # (N, *shape), of any of these types
+Observations = Array  # (N, *shape): pictures, numbers or mixed
 Fields = dict[str, tuple[DType, Shape]]  # by key
 Standard = tuple[Floats, Floats]  # mean and deviation of numbers
-DIGEST = 16  # bytes
-DEVIATIONS = 10.0  # numbers are clipped this far from their mean: beyond, nothing was learned
-MOST_ROWS = 20_000  # states from which mean and deviation are computed
+DIGEST = 16  # bytes of a digest
+DEVIATIONS = 10.0  # standardised numbers are clipped to this many deviations, because nothing was learned beyond them
+MOST_ROWS = 20_000  # the most states of a set from which mean and deviation are computed
 
 
 def digest(observation: Observations, labels: bytes | bytearray = b"") -> bytes:
-    """Bytes (``DIGEST``) that identify an observation among those of its shape and type, together with its labels."""
+    """Return ``DIGEST`` bytes that identify an observation and its labels among observations of one shape and type."""
     content = observation.tobytes() + labels
     return blake2b(content, digest_size=DIGEST).digest()
 
 
 def fields_of(shape: Shape, dtype: DType) -> Fields:
-    """Type and shape of an observation's parts by key; of one that is not mixed, its only part's, without a key."""
+    """Return the type and shape of an observation's parts by key.
+
+    An observation that is not mixed has one part, with the key "".
+    """
     if not dtype.names:
         return {"": (dtype, shape)}
     fields = {}
@@ -49,7 +53,7 @@ def fields_of(shape: Shape, dtype: DType) -> Fields:
 
 
 def values_in(shape: Shape, dtype: DType) -> int:
-    """How many values an observation has, bytes of pictures and numbers."""
+    """Return how many values an observation has, where a value is a byte of a picture or a number."""
     sizes = 0
     for _, size in fields_of(shape, dtype).values():
         sizes += prod(size)
@@ -57,7 +61,10 @@ def values_in(shape: Shape, dtype: DType) -> int:
 
 
 def mixed_type(fields: Fields) -> DType:
-    """The type of observations with these parts, sorted by key; malformed ones are a ``ValueError``."""
+    """Return the type of mixed observations with the parts ``fields``, sorted by key.
+
+    Raises ``ValueError`` if a key cannot be a file name, or if a part has no values.
+    """
     sizes = [min(shape, default=0) for _, shape in fields.values()]
     are_plain = plain_names([*fields])
     if not are_plain or min(sizes) <= 0:
@@ -67,7 +74,7 @@ def mixed_type(fields: Fields) -> DType:
 
 
 def type_text(dtype: DType) -> str:
-    """An observation's type as files keep it: ``uint8``, ``float32``, or JSON of ``{key: [type, shape]}``."""
+    """Return an observation's type as files keep it: ``uint8``, ``float32``, or JSON of ``{key: [type, shape]}``."""
     if not dtype.names:
         return str(dtype)
     parts = {key: [str(kind), shape] for key, (kind, shape) in fields_of((), dtype).items()}
@@ -75,7 +82,7 @@ def type_text(dtype: DType) -> str:
 
 
 def type_of(text: str) -> DType:
-    """The type that :func:`type_text` wrote; anything else is a ``ValueError``."""
+    """Return the type that :func:`type_text` wrote. Raises ``ValueError`` for any other text."""
     if text in KINDS:
         return KINDS[text]
     fields = {}
@@ -88,7 +95,10 @@ def type_of(text: str) -> DType:
 
 
 def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations:
-    """Mixed observations (N,) from arrays (N, ...) by key, all that ``dtype`` has if given; else a ``ValueError``."""
+    """Return mixed observations (N,) made of arrays (N, ...) by key.
+
+    Raises ``ValueError`` if the arrays differ in N, or if they do not have the type ``dtype``, where it is given.
+    """
     arrays = {}
     fields = {}
     for key, values in parts.items():
@@ -109,7 +119,7 @@ def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations
 
 
 def numbers_of(observations: Observations) -> Floats:
-    """All numbers of observations (N, ...), in a row each, float32 (N, D)."""
+    """Return all numbers of observations (N, ...), without their pictures, float32 (N, D)."""
     count = len(observations)
     fields = fields_of(observations.shape[1:], observations.dtype)
     rows = [np.zeros((count, 0), NUMBERS)]
@@ -122,7 +132,10 @@ def numbers_of(observations: Observations) -> Floats:
 
 
 def standard_of(shape: Shape, *observations: Observations) -> Standard:
-    """Mean and deviation (*shape) of numbers (N, *shape); the deviation is 1 where they hardly vary, or without any."""
+    """Return the mean and the deviation of numbers (N, *shape), float32 (*shape) each.
+
+    The deviation is 1 where the numbers hardly vary. Without ``observations`` the mean is 0, and the deviation is 1.
+    """
     rows = [states[:: 1 + len(states) // MOST_ROWS] for states in observations]
     nothing = np.zeros((1, *shape), NUMBERS)
     sample = np.concatenate(rows or [nothing])
@@ -134,12 +147,12 @@ def standard_of(shape: Shape, *observations: Observations) -> Standard:
 
 
 def standardised(observations: Any, mean: Any, deviation: Any) -> Any:
-    """Numbers (N, *shape), arrays or tensors, in deviations from their mean (*shape)."""
+    """Return numbers (N, *shape) in deviations (*shape) from their mean (*shape). All are arrays, or all tensors."""
     deviations = (observations - mean) / deviation
     return deviations.clip(-DEVIATIONS, DEVIATIONS)
 
 
 def spread_rows(count: int, most: int) -> Ints:
-    """All rows of ``count``, or ``most`` spread evenly, int64 (n,)."""
+    """Return the numbers of all ``count`` rows, or of ``most`` rows spread evenly over them, int64 (n,)."""
     wanted = min(count, most)
     return np.linspace(0, count - 1, wanted, dtype=int)

@@ -308,14 +308,15 @@ def tables(path: Path) -> Iterator[str]:
     for title, of in (("precision", int(found.sum())), ("recall", int(true.sum()))):
         low, high = binomtest(hits, of).proportion_ci(method="wilson")
         rows.append([title, f"{hits} of {of}", f"{hits / of:.2f} [{low:.2f}, {high:.2f}]"])
-    yield from table(["", "classifiers", "share"], rows)
+    yield from table(["measure", "classifiers", "share [95 % interval]"], rows)
     yield ""
     rows = []
     for fault, of_fault in scored.assign(found=found, true=true).groupby("fault", sort=False):
         payables = of_fault[of_fault["true"]]
         alarms = int(of_fault.loc[~of_fault["true"], "found"].sum())
-        rows.append([str(fault), str(len(of_fault)), f"{payables['found'].sum()} of {len(payables)}", str(alarms)])
-    yield from table(["fault", "classifiers", "payable, found", "false alarms"], rows)
+        found_ones = int(payables["found"].sum())
+        rows.append([str(fault), str(len(of_fault)), str(len(payables)), str(found_ones), str(alarms)])
+    yield from table(["fault", "classifiers", "of these, can be fooled", "found by the audit", "false alarms"], rows)
 
 
 def main(run: str, path: str) -> None:

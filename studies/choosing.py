@@ -213,8 +213,8 @@ def rooms(path: Path) -> Iterator[str]:
     yield f"Share of episodes solved, {NEWEST}.\n"
     yield from table(titles, _solved(newest))
     yield "The runs before, each with settings of its own.\n"
-    earlier = [[which, *cells] for which, rows in settings.items() for cells in _solved(rows)]
-    yield from table(["setting", *titles], earlier)
+    earlier = [[which, *cells] for which, rows in reversed(settings.items()) for cells in _solved(rows)]
+    yield from table(["batch", *titles], earlier)
     rows = []
     for method, title in ENSEMBLES.items():
         if method != "joint" and len(solved_by(newest, f"{method}-truth-shape", "agent")):
@@ -227,8 +227,8 @@ def rooms(path: Path) -> Iterator[str]:
         "D-BAT compared with",
         "rewarded",
         "D-BAT solves more by, mean",
-        "by, median",
-        "seeds on which it solves more",
+        "D-BAT solves more by, median",
+        "seeds on which D-BAT solves more",
     ]
     yield from table(titles, (row for method in ("none", "one") for row in _over_runs(runs, method)))
 

@@ -23,7 +23,7 @@ from hypogoal.domains.doorkey.domain import DOMAIN
 from studies.cells import interval, parser_of, read_rows, table
 
 METHODS = {
-    "grid": "D-BAT, distilled, grid, 200 layouts",
+    "grid": "D-BAT, distilled by the smaller network",
     "dbat": "D-BAT, distilled",
     "planned": "D-BAT, planned",
     "none": "no diversity, distilled",
@@ -31,7 +31,7 @@ METHODS = {
     "one": "one classifier, distilled",
     "one-planned": "one classifier, planned",
     "oracle": "true sub-goals, distilled",
-    "oracle-drawn": "true sub-goals, actions drawn",
+    "oracle-drawn": "true sub-goals, distilled, actions drawn",
 }
 CONTRASTS = (  # a minus b; of four, a minus b minus (c minus d)
     ("dbat", "planned"),
@@ -46,9 +46,9 @@ PLAYED = "1"  # the step of rows on these; the others are of layouts on which se
 WORLDS = {"many": "plain", "many-harsh": "harsh"}
 OPTIONS = {
     "distilled": "distilled",
-    "grid": "distilled, grid, 200 layouts",
-    "planned": "planned there",
-    "pixels-grid": "no options: PPO from pixels, grid",
+    "grid": "distilled by the smaller network",
+    "planned": "planned in the new layouts",
+    "pixels-grid": "none, PPO from pixels",
 }
 SCORES = {
     "within_2": "within twice the shortest path",

@@ -48,7 +48,7 @@ METHODS = {
     "ppo-paper": "PPO, the paper's setting",
     "dqn-paper": "DQN, the paper's setting",
     "literal": "D-BAT, the paper's networks, 150,000 steps",
-    "literal-none": "the same, networks without memory",
+    "literal-none": "D-BAT, the paper's networks without memory, 150,000 steps",
 }
 COLUMNS = ("method", "layout", "seed", "chooser", "quantity", "value")
 Agents = dict[tuple[str, str], list[dict[str, str]]]  # their rows, by method and layout
@@ -221,14 +221,14 @@ def tables(path: Path) -> Iterator[str]:
     yield f"Training, {len(layouts)} layouts; of the last 100 episodes over layouts.\n"
     titles = [
         "agent",
-        "layouts with 95 %",
+        "layouts on which it solves 95 %",
         "steps until then, median",
-        "its steps / D-BAT's, median",
-        "layouts on which it takes longer",
+        "times D-BAT's steps, median",
+        "layouts on which it takes longer than D-BAT",
         "solved at the end",
         "length / shortest, median",
-        "lowest share after 95 %",
-        "layouts that stay at .90 or more",
+        "lowest share solved after that",
+        "layouts on which that is .90 or more",
     ]
     yield from table(titles, (training(method) for method in methods))
     frozen = [method for method in methods if len(finite(values_of(method, "success", "frozen")))]

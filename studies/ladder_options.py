@@ -41,7 +41,7 @@ Settings = dict[str, Any]
 METHODS: dict[str, tuple[str, Settings, Settings]] = {  # a title, settings of the ensemble and of its options
     "dbat": ("D-BAT", {"diversity": "dbat"}, {}),
     "none": ("no diversity", {"diversity": "none"}, {}),
-    "cnn": ("single CNN", {"members": 1, "diversity": "none"}, {}),
+    "cnn": ("one classifier", {"members": 1, "diversity": "none"}, {}),
     "oracle": ("true sub-goal", {"diversity": "dbat"}, {"termination": "oracle"}),  # whatever the ensemble
 }
 ENSEMBLES = {"oracle": "dbat"}  # whose ensemble is another method's
@@ -141,9 +141,9 @@ def _leads(groups: int, measures: dict[str, Distances]) -> Iterator[str]:
     titles = [
         "compared with D-BAT",
         "which member",
-        "a start inside the set counts",
-        "stops farther by, units",
-        "seeds",
+        "a start at an own yes counts",
+        "stops farther away than D-BAT by, units",
+        "ensembles, by seed",
     ]
     yield from table(titles, rows)
 
@@ -179,7 +179,7 @@ def _tables(groups: int, distances: Distances, inside: Distances) -> Iterator[st
     began = []
     for ladder in whole:
         began.append([ladder, *(f"{np.mean([*inside[method, ladder].values()]):.2f}" for method in learned)])
-    yield from table(["ladder", *(METHODS[method][0] for method in learned)], began)
+    yield from table(["ladder", *(f"{METHODS[method][0]}, began at an own yes" for method in learned)], began)
 
 
 def best_mean_worst(seeds: dict[int, NDArray[np.float64]]) -> tuple[float, float, float]:

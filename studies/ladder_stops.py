@@ -29,7 +29,7 @@ from hypogoal.options.tables import Executions
 from studies.cells import table
 
 GROUPS, LADDER = 2, "3-9"
-METHODS = {"dbat": "D-BAT", "none": "no diversity", "cnn": "single CNN"}
+METHODS = {"dbat": "D-BAT", "none": "no diversity", "cnn": "one classifier"}
 NAME = re.compile(rf"options-{GROUPS}-(\w+)-(\d+)-{LADDER}-\d+\.csv")
 COLUMNS = ("method", "seed", "member", "room", "x", "y", "fate", "count")
 Stops = dict[tuple[str, int], NDArray[np.int64]]  # by method and seed: (n, 4), room, x, y and fate of each execution
@@ -80,7 +80,7 @@ def tables(path: Path) -> Iterator[str]:
             at_base = f"{(stops[:, 3] == HIT).mean():.2f}"
             inside = f"{(stops[:, 3] == BEGAN_INSIDE).mean():.2f}"
             rows.append([title, str(seed), at_base, inside, f"{spread(stops):.1f}"])
-    yield from table(["members", "seed", "ended at a base", "began inside the own set", "spread, units"], rows)
+    yield from table(["members", "seed", "ended at a base", "began at an own yes", "spread, units"], rows)
 
 
 def draw(path: Path, seed: int, picture: Path) -> None:

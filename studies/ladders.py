@@ -175,7 +175,7 @@ def _tables(groups: int, numbers: Numbers) -> Iterator[str]:
     seeds = list(numbers["dbat"])
     yield f"N = {groups}, {len(seeds)} seeds, cross-fitted:"
     yield "length and member picked on half of the unseen rooms, scored on the other.\n"
-    lengths = ["training steps picked on one half", "on the other half"]
+    lengths = ["training steps that rank best on one half", "training steps that rank best on the other half"]
     scores = ["ranking", "balanced accuracy at 0.5", "D-BAT ranks better by", "seeds on which it ranks better"]
     rows = [_cross_fitted(numbers, method) for method in numbers]
     yield from table(["method", *lengths, *scores], rows)

@@ -57,6 +57,11 @@ METHODS: dict[str, dict[str, Any]] = {  # settings of train-ensemble, beside the
     "1,000 unlabelled levels": {},
     "no diversity, K = 16": {**NO_DIVERSITY, "members": 16},
 }
+TITLES = {  # of methods whose name does not say all; the others are called as they are
+    "D-BAT, unpaired": "control that pairs nobody",
+    "K = 3": "independent, three members",
+    "1,000 unlabelled levels": "independent, 1,000 unlabelled levels",
+}
 PLAYED = 8  # of these methods, the first, have agents
 FIRST, ORACLE = "independent", "true sub-goals"
 LEVELS = {"labelled": 160, "unlabelled": 300, "heldout": 60, "new": 30}
@@ -161,21 +166,21 @@ def tables(path: Path) -> Iterator[str]:
 Numbers = dict[str, dict[int, float]]  # by column and seed
 OF_MEMBERS = (
     "members",
-    "weights chosen",
-    "seeds with both owned",
+    "weights",
+    "seeds with both features owned",
     "best member's balanced accuracy by colour",
-    "by shape",
+    "best member's balanced accuracy by shape",
 )
 OF_AGENTS = (
     "members",
     "colour, episodes 11-20",
-    "shape, 11-20",
-    "colour, 51-100",
-    "shape, 51-100",
-    "worse task, 51-100",
-    "random choice, both",
-    "independent minus it, both",
-    "seeds on which it leads",
+    "shape, episodes 11-20",
+    "colour, episodes 51-100",
+    "shape, episodes 51-100",
+    "worse task, episodes 51-100",
+    "random choice, mean of both tasks",
+    "independent solves more by, median",
+    "seeds on which independent solves more",
 )
 
 
@@ -202,7 +207,7 @@ def members_of(numbers: dict[str, Numbers]) -> Iterator[list[str]]:
         accuracies = [in_order(own, f"owned_{feature}") for feature in FEATURES]
         both = np.minimum(*accuracies) >= OWNED
         weights = ", ".join(f"{weight:g}" for weight in np.unique(in_order(own, "weight")))
-        yield [method, weights, f"{both.sum()} of {len(both)}", *map(share, accuracies)]
+        yield [TITLES.get(method, method), weights, f"{both.sum()} of {len(both)}", *map(share, accuracies)]
 
 
 def agents_of(numbers: dict[str, Numbers]) -> Iterator[list[str]]:
@@ -216,7 +221,7 @@ def agents_of(numbers: dict[str, Numbers]) -> Iterator[list[str]]:
         chance = share(np.mean(by_chance, axis=0)) if len(by_chance[0]) else "-"
         lead = lead_of(numbers[FIRST], own)
         versus = ["-", "-"] if method == FIRST else [amount(lead), won(lead)]
-        yield [method, *map(share, solved), share(worse), chance, *versus]
+        yield [TITLES.get(method, method), *map(share, solved), share(worse), chance, *versus]
 
 
 def lead_of(first: Numbers, other: Numbers) -> Floats:

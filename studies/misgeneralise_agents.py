@@ -40,6 +40,14 @@ UNSEEN = "PPO, in labelled levels it has not seen"
 NEW = "PPO of labelled levels, in new levels"
 TUNED = "the same, learning in new levels"
 SCRATCH = "PPO, learning in new levels from nothing"
+TITLES = {  # as the tables call them
+    LEARNED: "options, learning in new levels",
+    SEEN: "PPO, learning in labelled levels",
+    UNSEEN: "this PPO, frozen, in other labelled levels",
+    NEW: "this PPO, frozen, in new levels",
+    TUNED: "this PPO, learning on in new levels",
+    SCRATCH: "another PPO, learning in new levels from nothing",
+}
 AGENTS = (LEARNED, SEEN, UNSEEN, NEW, TUNED, SCRATCH)
 OPTION_STEPS = 40_000
 OPTIONS: dict[str, Any] = {"network": "light", "environments": 16, "epsilon_steps": 15_000}
@@ -47,6 +55,14 @@ PPO_STEPS = 40_000
 LOOKED_AT = 200  # episodes
 ENOUGH, WINDOW = 0.9, 100
 CAP = 100  # steps of an episode
+OF_AGENTS = (
+    "agent",
+    "task",
+    "episodes in all, median",
+    "solved at the end",
+    "seeds that came to 90 %",
+    "episodes until 90 %, median of these seeds",
+)
 KEYS = ("world", "agents", "seed")
 COLUMNS = (*KEYS, "agent", "task", "step", "episodes", "solved", "episodes_to_90")
 
@@ -146,9 +162,9 @@ def tables(path: Path) -> Iterator[str]:
             to_90 = f"{np.median(arrived):,.0f}" if 2 * len(arrived) > len(own) else "never"
             is_look = agent in (UNSEEN, NEW)
             reached = ["-", "-"] if is_look else [f"{len(arrived)} of {len(own)}", to_90]
-            shown.append([agent, task, f"{np.median(episodes):,.0f}", solved, *reached])
+            shown.append([TITLES[agent], task, f"{np.median(episodes):,.0f}", solved, *reached])
         yield ""
-        yield from table(["", "task", "episodes, median", "solved", "reached 90 %", "after episodes, median"], shown)
+        yield from table(OF_AGENTS, shown)
 
 
 def main() -> None:

@@ -366,8 +366,9 @@ def _table(rows: list[dict[str, str]]) -> Iterator[str]:
         ratios = np.array([numbers[layout] / first[layout] for layout in numbers])
         shares = [_mean(own, quantity) for quantity in QUANTITIES[:-1]]
         shown.append([title, *_summary(values), amount(ratios, 1), *shares, _steps(own)])
-    of_episodes = [f"solved of episodes {part}" for part in ("1-10", "11-20", "21-50", "51-100")]
-    until = ["episodes until then, median", "mean", "most", "times those of the first row, median"]
+    of_episodes = [f"share solved of episodes {part}" for part in ("1-10", "11-20", "21-50", "51-100")]
+    episodes = ["episodes until then, median", "episodes, mean", "episodes, most"]
+    until = [*episodes, "times the first row's episodes, median"]
     yield from table(["chooser", "agents that arrived", *until, *of_episodes, "steps to 95 of 100, median"], shown)
 
 
@@ -377,8 +378,8 @@ def _mean(rows: list[dict[str, str]], quantity: str) -> str:
 
 
 def _steps(rows: list[dict[str, str]]) -> str:
-    """The median steps to 95 of 100 episodes, practice included; never where most do not arrive."""
-    values = [float(row["steps_to_95"] or "inf") + float(row["practised"]) for row in rows]
+    """The median steps to 95 of 100 episodes, which count from the first step of practice; never if most do not arrive."""
+    values = [float(row["steps_to_95"] or "inf") for row in rows]
     median = np.median(values)
     return "never" if np.isinf(median) else f"{median:,.0f}"
 

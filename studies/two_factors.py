@@ -140,7 +140,7 @@ def tables(path: Path) -> Iterator[str]:
         shown = "never" if least is None else f"from {least} seeds on"
         lines.append([method, *(f"{coverages[seeds]:.2f}" for seeds in SEEDS), shown])
     yield f"Coverage on the worst shape, by the number of seeds, with {LADDERS} ladders.\n"
-    yield from table(["method", *(f"{seeds} seeds" for seeds in SEEDS), "admitted"], lines)
+    yield from table(["method", *(f"{seeds} seeds" for seeds in SEEDS), "reaches .93"], lines)
 
 
 def main() -> None:

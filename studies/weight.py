@@ -94,7 +94,7 @@ def tables(path: Path) -> Iterator[str]:
         lines[-1] += [amount(more), won(more)] if method != "auto" else ["-", "-"]
     solved_by = [f"solved, {feature}" for feature in FEATURES]
     apart = ["auto solves more by, median", "seeds on which auto solves more"]
-    names = ["members", "weights chosen", "seeds with both owned", *solved_by, "solved, mean of both", *apart]
+    names = ["members", "weights", "seeds with both features owned", *solved_by, "solved, mean of both", *apart]
     yield ""
     yield from table(names, lines)
 

@@ -102,6 +102,7 @@ class Case:
     methods: dict[str, dict[str, Any]] = field(default_factory=lambda: {"auto": AUTO})
     spoil: Spoil | None = None
     judge: Judge = by_features
+    columns: tuple[str, str] = ("first", "second")  # as the table has them
 
 
 CASES = {
@@ -129,6 +130,7 @@ CASES = {
             },
         },
         judge=by_colour_and_shape,
+        columns=("second", "first"),
     ),
 }
 
@@ -154,30 +156,25 @@ def run_cell(name: str, method: str, seed: int) -> list[Row]:
 
 
 def tables(path: Path) -> Iterator[str]:
-    """What the rows say, as lines of Markdown."""
+    """What the rows say, as lines of Markdown: a table of data with planted features, and one of those without."""
     rows = read_rows(path)
-    lines = []
+    planted: list[list[str]] = []
+    others: list[list[str]] = []
     for name, case in CASES.items():
         for method in case.methods:
             cells = [row for row in rows if (row["case"], row["method"]) == (name, method)]
             if not cells:
                 continue
             weights = sorted({float(weight) for row in cells for weight in row["weight"].split()})
-            numbers = [np.array([float(row[column]) for row in cells]) for column in ("first", "second")]
+            numbers = [np.array([float(row[column]) for row in cells]) for column in case.columns]
             idle = sum(int(row["idle"]) for row in cells)
             told = ", ".join(f"{weight:g}" for weight in weights)
-            lines.append([name, method, told, *map(interval, numbers), str(idle), str(len(cells))])
+            line = [name, method, told, *map(interval, numbers), str(idle), str(len(cells))]
+            (others if case.judge == by_labels else planted).append(line)
+    first, last = ["data", "method", "weights"], ["useless members, of all seeds", "seeds"]
     yield ""
-    titles = [
-        "data",
-        "method",
-        "weights chosen",
-        "first score",
-        "second score",
-        "members that are no hypothesis",
-        "seeds",
-    ]
-    yield from table(titles, lines)
+    yield from table([*first, "best member, by shape", "best member, by the other feature", *last], planted)
+    yield from table([*first, "best member", "mean member", *last], others)
 
 
 def main() -> None:

@@ -25,8 +25,9 @@ from hypogoal.observations import PICTURE
 from hypogoal.options.double_dqn import linear_epsilon
 
 LOG_INTERVAL = 5_000  # environment steps
-UPDATED = "train/"  # before the names of the library's numbers of an update
-# What changes while an agent learns, where it has it: first counts, then what each environment showed last.
+UPDATED = "train/"  # the prefix of stable-baselines3's names for the numbers of an update
+# The attributes that change while an agent learns. An agent need not have all. The last two say what each environment
+# showed last.
 CHANGING = (
     "num_timesteps",
     "_n_updates",
@@ -41,9 +42,9 @@ REPLAY_COLUMNS = ("observations", "next_observations", "actions", "rewards", "do
 
 
 class ExploringDQN(DQN):
-    """DQN whose every environment explores on its own, with an epsilon that may wait for the first goal.
+    """A DQN in which each environment explores on its own, with an epsilon that may wait for the first goal.
 
-    stable-baselines3 tosses one coin for all environments at once and counts epsilon's fall from step 0.
+    stable-baselines3 tosses one coin for all environments at once, and counts epsilon's fall from step 0.
     """
 
     explore_rng: np.random.Generator
@@ -55,7 +56,7 @@ class ExploringDQN(DQN):
         episode_start: Any = None,
         deterministic: bool = False,
     ) -> Any:
-        """Epsilon-greedy actions (N,) for observations (N, C, H, W); greedy where ``deterministic``."""
+        """Return actions (N,) for observations (N, ...), epsilon-greedy, or greedy if ``deterministic``."""
         actions, state = self.policy.predict(
             observation,
             state,
@@ -70,7 +71,7 @@ class ExploringDQN(DQN):
 
 
 class Watch(BaseCallback):
-    """Logs every ``LOG_INTERVAL`` steps, stops at NaN, and offers a checkpoint of all before each rollout."""
+    """A callback that logs every ``LOG_INTERVAL`` steps, stops at NaN, and offers a checkpoint before each rollout."""
 
     def __init__(
         self,
@@ -86,7 +87,7 @@ class Watch(BaseCallback):
         self.checkpoints.offer(self.snapshot)
 
     def snapshot(self) -> State:
-        """Where the agent is, and how much is logged."""
+        """Return the state of the agent and of its environments, and how much is logged."""
         return {"agent": agent_snapshot(self.model, self.env), "log": self.log.snapshot()}
 
     def _on_step(self) -> bool:
@@ -110,7 +111,7 @@ class Watch(BaseCallback):
 
 
 def check_finite(model: BaseAlgorithm, step: int) -> None:
-    """A ``NumericalError`` where a weight of the agent is NaN or infinite."""
+    """Raise ``NumericalError`` if a weight of the agent is NaN or infinite."""
     for name, weight in model.policy.named_parameters():
         if not torch.isfinite(weight).all():
             raise NumericalError(f"NaN or Inf in {type(model).__name__}'s {name} at step {step}")
@@ -122,8 +123,8 @@ def make_agent(
     seed: int,
     device: str = "cpu",
 ) -> BaseAlgorithm:
-    """A fresh agent; a ``UserError`` where PPO has more environments than steps between two updates."""
-    seen: dict[str, Any] = {"net_arch": [FEATURES, FEATURES]}  # of numbers
+    """Return a new agent. Raises ``UserError`` if PPO has more environments than steps between two updates."""
+    seen: dict[str, Any] = {"net_arch": [FEATURES, FEATURES]}  # for observations that are numbers
     if env.observation_space.dtype == PICTURE:
         network = {"tiles": env.tiles, "rows": env.engine.observation_shape[0] // CELL}
         features = {"features_extractor_class": NETWORKS[chosen.network], "features_extractor_kwargs": network}
@@ -146,7 +147,7 @@ def make_agent(
             learning_starts=chosen.warm_up,
             tau=chosen.target_tau,
             train_freq=1,
-            target_update_interval=chosen.target_interval * env.num_envs,  # it counts environment steps
+            target_update_interval=chosen.target_interval * env.num_envs,  # the interval is in environment steps
         )
         agent.explore_rng = rng_for(seed, "explore")
         agent.exploration_schedule = lambda _: epsilon(chosen, env.episodes)
@@ -159,7 +160,8 @@ def make_agent(
         )
     else:
         with warnings.catch_warnings():
-            # Table 5's 100 decisions do not divide into batches of 64; and advice on the device, which the user chose.
+            # PPO warns that the 100 decisions of Table 5 do not divide into batches of 64. It also gives advice on the
+            # device, but the user chose the device.
             warnings.simplefilter("ignore")
             agent = PPO(
                 **common,
@@ -183,10 +185,11 @@ def train(
     checkpoints: Checkpoints,
     device: str = "cpu",
 ) -> BaseAlgorithm:
-    """Train a fresh agent for ``steps`` environment steps of all environments, rounded up to whole rollouts.
+    """Train a new agent, and return it.
 
-    ``env.episodes`` is filled; ``log`` and ``progress`` are told of every ``LOG_INTERVAL`` steps. Checkpoints
-    are of no use where the engine cannot be resumed. NaN or Inf in a weight is a ``NumericalError``.
+    Training takes ``steps`` environment steps, all environments together, rounded up to whole rollouts. It fills
+    ``env.episodes`` and writes to ``log`` every ``LOG_INTERVAL`` steps. Without an engine that can be resumed,
+    ``checkpoints`` are not used. Raises ``NumericalError`` if a weight becomes NaN or infinite.
     """
     if not env.engine.resumes:
         checkpoints = Checkpoints(None)
@@ -209,10 +212,10 @@ def train(
 
 
 def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> State:
-    """An agent before a rollout, its environments, and the global generators that it draws from.
+    """Return the state of an agent before a rollout, of its environments and of the global random generators.
 
-    The library saves its agents as pickles, without their environments and random numbers. Here what it knows between
-    two rollouts is written down field by field; within a rollout (under a second) it cannot be interrupted.
+    stable-baselines3 saves agents as pickles, without their environments and random generators. So this function takes
+    the state field by field. Within a rollout, which takes under a second, no state can be taken.
     """
     snapshot = {
         "parts": [snapshot_of(part) for part in _parts(agent, env)],
@@ -228,7 +231,7 @@ def agent_snapshot(agent: BaseAlgorithm, env: EngineEnv) -> State:
 
 
 def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, Any]) -> None:
-    """Continue from an ``agent_snapshot`` of such an agent."""
+    """Continue from an ``agent_snapshot`` of an agent made with the same arguments."""
     for part, saved in zip(_parts(agent, env), snapshot["parts"], strict=True):
         restored(part, saved)
     for name, value in snapshot["values"].items():
@@ -243,19 +246,19 @@ def restore_agent(agent: BaseAlgorithm, env: EngineEnv, snapshot: Mapping[str, A
 
 
 def _parts(agent: BaseAlgorithm, env: EngineEnv) -> list[Any]:
-    """Networks, optimiser and generators of an agent, and its environments."""
+    """Return the networks, the optimiser, the random generators and the environments of an agent."""
     parts = [agent.policy, agent.policy.optimizer, agent.action_space.np_random, env, GlobalRandomness()]
     return [*parts, agent.explore_rng] if isinstance(agent, ExploringDQN) else parts
 
 
 def _updated(agent: BaseAlgorithm) -> dict[str, float]:
-    """The library's numbers of the last update."""
+    """Return stable-baselines3's numbers of the last update, by name."""
     logged = agent.logger.name_to_value
     return {name: float(value) for name, value in logged.items() if name.startswith(UPDATED)}
 
 
 class GlobalRandomness(Resumable):
-    """The global generators that the library draws from."""
+    """The global random generators from which stable-baselines3 draws."""
 
     def snapshot(self) -> State:
         return {"torch": torch.get_rng_state(), "numpy": np.random.get_state(legacy=False)}  # noqa: NPY002
@@ -267,7 +270,7 @@ class GlobalRandomness(Resumable):
 
 @contextlib.contextmanager
 def own_randomness() -> Iterator[None]:
-    """Lend stable-baselines3 the global generators, which it seeds, and put them back afterwards."""
+    """Lend stable-baselines3 the global random generators, which it seeds, and restore them when the context ends."""
     lent, python = GlobalRandomness(), random.getstate()
     before = lent.snapshot()
     try:
@@ -278,13 +281,16 @@ def own_randomness() -> Iterator[None]:
 
 
 def weights(agent: BaseAlgorithm) -> dict[str, Tensor]:
-    """The agent's weights by name, shared ones once, without the target network's."""
+    """Return the agent's weights by name. Shared weights are there once, and those of the target network are not."""
     named = agent.policy.named_parameters()
     return {name: weight.detach() for name, weight in named if not name.startswith("q_net_target.")}
 
 
 def epsilon(chosen: DQNSettings, episodes: EpisodeRecorder) -> float:
-    """Table 4: exploration falls from 1 to the final value, linearly, from the start or the first goal on."""
+    """Return the share of random actions, which falls linearly from 1 to its final value (Table 4).
+
+    It begins to fall at the start, or at the first goal.
+    """
     step = episodes.steps
     if chosen.epsilon_from == "first-goal":
         step -= next((episode.step for episode in episodes.rows if episode.succeeded), step)

@@ -20,16 +20,19 @@ from hypogoal.domains.episodes import EpisodeRecorder
 from hypogoal.observations import PICTURE, Observations, standardised
 
 FEATURES = 128
-CELL = 8  # pixels; the first convolution's kernel and stride
+CELL = 8  # pixels, the kernel size and the stride of the first convolution
 
 
 class EngineEnv(VecEnv, Resumable):
-    """All environments of an engine, with its primitive actions and images.
+    """All environments of an engine as a vectorised environment, with the engine's primitive actions.
 
-    Observations are the engine's images, uint8 (C, H, W), or its numbers, float32, by its ``standard`` if there is one;
-    where images are made of tiles, the cells' tile codes, uint8 (cells,), which say the same in 1/192 of the bytes (see
-    :class:`CellNetwork`). An episode cut at its step limit is marked as truncated: its last state is not a terminal
-    one. ``episodes`` are those that ended.
+    Observations are the engine's images, uint8 (C, H, W), or its numbers, float32, standardised by the engine's
+    ``standard`` if there is one. If images are made of tiles, observations are the tile codes of their cells, uint8
+    (cells,), which say the same in 1/192 of the bytes (see :class:`CellNetwork`). An episode that is cut at its step
+    limit is marked as truncated, because its last state is not terminal.
+
+    Attributes:
+        episodes: records the episodes that ended.
     """
 
     CHANGING = ("engine", "episodes")
@@ -67,15 +70,15 @@ class EngineEnv(VecEnv, Resumable):
         return standardised(images, *self.engine.standard)
 
     def reset(self) -> Observations:
-        """Put every environment at the start of an episode."""
+        """Begin an episode in every environment. Return the observations."""
         return self._observe(self.engine.reset())
 
     def step_async(self, actions: Array) -> None:
-        """Take note of the actions (count,) of the next step."""
+        """Keep the actions (count,) for the next step."""
         self._actions = np.asarray(actions, int)
 
     def step_wait(self) -> tuple[Observations, Floats, Bools, list[dict[str, Any]]]:
-        """Step every environment; where an episode ended, the observation is that of the next one's start."""
+        """Step every environment. Where an episode ended, the observation shows the start of the next episode."""
         step = self.engine.step(self._actions)
         self.episodes.see(step)
         done = step.terminated | step.truncated
@@ -88,30 +91,31 @@ class EngineEnv(VecEnv, Resumable):
         return observations, step.rewards, done, infos
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing, because there is nothing to close."""
 
     def get_attr(self, *_: Any, **__: Any) -> list[Any]:
-        """None: VecEnv asks for ``render_mode``, and an engine is never shown."""
+        """Return None for each environment. VecEnv asks for ``render_mode``, but an engine is never shown."""
         return [None] * self.num_envs
 
     def set_attr(self, *_: Any, **__: Any) -> None:
-        """Not supported: an engine's attributes are fixed."""
+        """Raise ``NotImplementedError``, because an engine's attributes are fixed."""
         raise NotImplementedError
 
     def env_method(self, *_: Any, **__: Any) -> list[Any]:
-        """Not supported: an engine has no per-environment methods."""
+        """Raise ``NotImplementedError``, because an engine has no methods of a single environment."""
         raise NotImplementedError
 
     def env_is_wrapped(self, *_: Any, **__: Any) -> list[bool]:
-        """An engine wears no Gymnasium wrappers."""
+        """Return False for each environment, because an engine has no Gymnasium wrappers."""
         return [False] * self.num_envs
 
 
 class BlockConvolution(nn.Module):
-    """A convolution whose stride is its kernel size, as one matrix product: ``nn.Conv2d(c, out, size, stride=size)``.
+    """A convolution whose stride is its kernel size, computed as one matrix product.
 
-    On images as small as these that takes half the time of a convolution routine (a CPU thread). (N, H, W, channels)
-    to (N, H / size, W / size, out); what is left over at the lower and the right edge is not looked at.
+    The layer is ``nn.Conv2d(channels, out, size, stride=size)``, but maps (N, H, W, channels) to
+    (N, H // size, W // size, out). The pixels left over at the lower and the right edge are not used. On images as
+    small as a grid world's, a matrix product takes half the time of a convolution routine (one CPU thread).
     """
 
     def __init__(self, channels: int, out: int, size: int):
@@ -129,12 +133,18 @@ class BlockConvolution(nn.Module):
 
 
 class CellNetwork(BaseFeaturesExtractor):
-    """Convolutions that each see a block at a time, the first one an 8 x 8 cell, then dense layers.
+    """A network of convolutions over blocks that do not overlap, and of dense layers.
 
-    ``channels`` are of the convolutions, those after the first with kernel 2; ``dense`` layers follow. Observations are
-    float images (N, C, H, W) in 0..1 or, where the engine's images are made of ``tiles``, uint8 (codes, 8, 8, C), so
-    many ``rows`` of them, the cells' codes (N, cells). Then the first convolution is computed once per tile and looked
-    up: the same function of the image, up to rounding, several times faster.
+    Observations are float images (N, C, H, W) in 0..1, or with ``tiles`` the tile codes of cells (N, cells). With
+    ``tiles`` the first convolution is computed once per tile and looked up. That is the same function of the image, up
+    to rounding, but several times faster.
+
+    Args:
+        channels: the output channels of each convolution. The blocks of the first convolution are cells of 8 x 8
+            pixels, and the blocks of the others are 2 x 2.
+        dense: the number of dense layers, which follow the convolutions.
+        tiles: uint8 (codes, 8, 8, C), the tiles of which the engine's images are made.
+        rows: the number of rows of cells in an image, if there are ``tiles``.
     """
 
     tiles: Tensor | None
@@ -168,7 +178,7 @@ class CellNetwork(BaseFeaturesExtractor):
         self.dense = nn.Sequential(*layers)
 
     def _cells(self, observations: Tensor) -> Tensor:
-        """The first convolution and ReLU: (N, rows, columns, channels)."""
+        """Return the output of the first convolution after ReLU, (N, rows, columns, channels)."""
         if self.tiles is None:
             return torch.relu(self.first(observations.permute(0, 2, 3, 1)))
         table = torch.relu(self.first(self.tiles)).flatten(start_dim=1)
@@ -184,8 +194,8 @@ class CellNetwork(BaseFeaturesExtractor):
         return self.dense(self.further(self._cells(observations)))
 
 
-# The paper's three convolutions with ReLU between and a dense layer shared by actor and critic, for which it gives no
-# sizes (these are small), and the tuned one: one convolution over cells, two dense layers.
+# ``three-conv`` is the paper's: three convolutions with ReLU between, and a dense layer that actor and critic share.
+# The paper gives no sizes, and ours are small. ``cells`` is the tuned network.
 NETWORKS = {
     "three-conv": partial(CellNetwork, channels=(16, 32, 64), dense=1),
     "cells": partial(CellNetwork, channels=(8,), dense=2),

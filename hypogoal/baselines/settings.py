@@ -1,7 +1,8 @@
-"""Every number of the four baselines in one table: PPO and DQN, in the paper's setting and in a tuned one.
+"""Every number of the four baselines, which are PPO and DQN, each in the paper's setting and in a tuned one.
 
-The paper gives Tables 4 and 5 only for the agents it trains itself and says no more of its PPO and DQN baselines; we
-read the two tables as theirs too. Where it is silent the value is stable-baselines3's default or ours, and says so.
+The paper gives Tables 4 and 5 for its own agents only, and says no more of its PPO and DQN baselines. We read the two
+tables as the baselines', too. Where the paper gives no value, the value is stable-baselines3's default or ours, and a
+comment says which.
 """
 
 from dataclasses import dataclass
@@ -12,14 +13,14 @@ from hypogoal.domains.world import WorldConfig
 
 @dataclass(frozen=True)
 class PPOSettings:
-    """Hyperparameters of proximal policy optimisation (Schulman et al. 2017); by default the paper's."""
+    """Hyperparameters of proximal policy optimisation (Schulman et al. 2017). The defaults are the paper's setting."""
 
     network: str = "three-conv"  # feature network, see engine_env.py
-    environments: int = 4  # stepped together
-    rollout: int = 100  # decisions per update, over all environments (Table 5)
+    environments: int = 4  # number of environments stepped together
+    rollout: int = 100  # decisions per update, all environments together (Table 5)
     batch: int = 64  # decisions per minibatch (Table 5)
     epochs: int = 10  # passes over a rollout (Table 5)
-    learning_rate: float = 2.5e-4  # Adam's step size (Table 4's; Table 5 gives none)
+    learning_rate: float = 2.5e-4  # Adam's step size (from Table 4, since Table 5 gives none)
     entropy: float = 0.01  # entropy coefficient (Table 5)
     gae_lambda: float = 0.97  # lambda of the advantage estimate (Table 5)
     gamma: float = 0.99  # discount per step (stable-baselines3)
@@ -28,13 +29,13 @@ class PPOSettings:
 
 @dataclass(frozen=True)
 class DQNSettings:
-    """Hyperparameters of deep Q-learning (Mnih et al. 2015); by default the paper's.
+    """Hyperparameters of deep Q-learning (Mnih et al. 2015). The defaults are the paper's setting.
 
-    Four environments with one update per joint step are its "update interval 4" with a quarter of the overhead.
+    Four environments with one update per joint step are the paper's "update interval 4" at a quarter of the overhead.
     """
 
     network: str = "three-conv"  # feature network, see engine_env.py
-    environments: int = 4  # stepped together: one update per joint step
+    environments: int = 4  # number of environments stepped together, with one update per joint step
     replay: int = 100_000  # transitions kept (Table 4)
     batch: int = 32  # transitions per update (Table 4)
     learning_rate: float = 2.5e-4  # Adam's step size (Table 4)
@@ -44,12 +45,12 @@ class DQNSettings:
     epsilon_steps: int = 8_000  # steps until the final epsilon (Table 4)
     epsilon_final: float = 0.01  # final epsilon (Table 4)
     warm_up: int = 1_000  # steps before the first update (ours)
-    gamma: float = 0.95  # discount per step (ours: at 0.99 it does not learn a corridor)
+    gamma: float = 0.95  # discount per step (ours, because DQN does not learn a corridor with 0.99)
 
 
-# By agent and setting. The tuned settings are the best of a random search on three-key DoorKey, thirty of each agent on
-# layouts 400 to 402 (docs/results/history.md): of PPO the one that was tuned by hand before, of DQN trial 8, which
-# keeps exploring until it has seen the goal once and then for long.
+# Hyperparameters by agent and setting. The tuned settings are the best of a random search on three-key DoorKey, which
+# tried thirty settings of each agent on layouts 400 to 402 (docs/results/history.md). PPO's best was the setting that
+# had been tuned by hand before. DQN's best, trial 8, explores until it has seen the goal once, and then for long.
 HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
     ("ppo", "paper"): PPOSettings(),
     ("dqn", "paper"): DQNSettings(),
@@ -77,7 +78,7 @@ HYPERPARAMETERS: dict[tuple[str, str], PPOSettings | DQNSettings] = {
 
 
 class BaselineConfig(WorldConfig):
-    """Which agent, and for how long; 'setting' chooses the hyperparameters."""
+    """Which agent is trained, and for how long. The field 'setting' chooses the hyperparameters."""
 
     agent: str = setting(
         "ppo",
@@ -94,7 +95,7 @@ class BaselineConfig(WorldConfig):
         low=0,
         high=4096,
     )
-    # Last, because from here on the name means this field.
+    # This field is the last, because after it ``setting`` no longer means the function.
     setting: str = setting(
         "tuned",
         "hyperparameters: the paper's tables, or tuned ones",

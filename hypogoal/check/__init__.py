@@ -1,6 +1,6 @@
-"""The contracts of domains, objectives, networks and other parts, as laws that users check theirs by.
+"""The contracts of domains, objectives, networks and other parts, as laws by which users check their own.
 
-``hypogoal check`` prints a line for each law. In your own test suite: ``require(check_domain(DOMAIN))``.
+``hypogoal check`` prints a line for each law. In your own test suite, write ``require(check_domain(DOMAIN))``.
 """
 
 from hypogoal.check.data import check_data

@@ -1,4 +1,4 @@
-"""A data file before hours of training: enough labels, more than one hypothesis, what training will cost."""
+"""A check of a data file before hours of training: enough labels, more than one hypothesis, the cost of training."""
 
 import warnings
 from collections.abc import Iterator, Sequence
@@ -15,18 +15,18 @@ from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.scores import idle_members, mean_disagreement
 from hypogoal.hypotheses.sub_goals import checked
 
-SECONDS = 45.0  # of training, for all sub-goals together
-TIMED = 10  # steps
-FEWEST = 50  # steps, with fewer a training says nothing
-USUAL = 4  # weights that are tried in the median
+SECONDS = 45.0  # how long all sub-goals together are trained
+TIMED = 10  # steps that are timed
+FEWEST = 50  # steps; with fewer, a training says nothing
+USUAL = 4  # the median number of weights that are tried
 PAIR = {"members": 2, "restarts": 2}  # enough to see whether there is a second hypothesis
 
 
 def check_data(path: Path, config: TrainEnsembleConfig, *, seed: int = 0) -> Iterator[Verdict]:
-    """Whether ``train-ensemble`` with these settings can find more than one hypothesis in a data file, in a minute.
+    """Check whether ``train-ensemble`` can find more than one hypothesis in a data file, in a minute.
 
-    Says whether there are enough labels, how much two members can differ on unlabelled states while they keep the
-    labels, and how long training will take.
+    The verdicts say whether there are enough labels, how much two members can differ on unlabelled states while they
+    keep the labels, and how long training will take with the settings ``config``.
     """
     prepare()
     dataset = open_dataset(path)
@@ -42,7 +42,7 @@ class _Data:
     config: TrainEnsembleConfig
     sub_goals: Sequence[str]
     seed: int
-    seconds: dict[str, float] = field(default_factory=dict)  # of a step, by sub-goal
+    seconds: dict[str, float] = field(default_factory=dict)  # seconds of a step, by sub-goal
 
     def labels(self) -> str:
         """Both classes have enough labels."""
@@ -79,7 +79,7 @@ class _Data:
         return "; ".join(texts)
 
     def cost(self) -> str:
-        """Training takes so long on this machine."""
+        """The time that training takes is known."""
         usual = most = 0.0
         for sub_goal in self.sub_goals:
             training = self.training(sub_goal, self.config)
@@ -89,18 +89,18 @@ class _Data:
         return f"train-ensemble takes some {_minutes(usual / workers)}, at most {_minutes(most / workers)}"
 
     def timed(self, sub_goal: str) -> float:
-        """The seconds of a step, with its share of the others' work."""
+        """Return the seconds of a step, with the step's share of other work."""
         training = self.training(sub_goal, self.config.model_copy(update={"steps": TIMED, "restarts": 1}))
         begun = 0.0
         for _ in training.steps():
-            if training.step == 1:  # it compares pictures first
+            if training.step == 1:  # not timed, because the first step compares pictures
                 begun = perf_counter()
             if training.step == TIMED:
                 break
         return (perf_counter() - begun) / (TIMED - 1)
 
     def training(self, sub_goal: str, config: TrainEnsembleConfig) -> AutoTraining:
-        """The training of a sub-goal's ensemble, not begun."""
+        """Return the training of a sub-goal's ensemble, not begun."""
         labelled, unlabelled = self.dataset.labelled(sub_goal), self.dataset.unlabelled_states()
         return training_of(labelled, unlabelled, sub_goal, config, self.seed)
 

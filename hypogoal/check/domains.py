@@ -29,10 +29,10 @@ SEEDED = "All randomness must come from the seed, also from 0: Gymnasium's from 
 
 
 def check_domain(domain: Domain, config: Config | None = None, *, seed: int = 0) -> Iterator[Verdict]:
-    """Whether a domain keeps the promises that the stages rely on.
+    """Check whether a domain keeps the promises that the stages rely on.
 
-    Plays a layout at random, and collects a few states twice with ``config``, an instance of its ``config_class``
-    (None: the defaults). ``seed`` is for both. A sub-goal that play does not reach is a warning.
+    The check plays a layout at random, and collects a few states twice with ``config``, an instance of the domain's
+    ``config_class`` (None: the defaults). ``seed`` seeds both. A sub-goal that play does not reach is a warning.
     """
     laws = [
         _Played.gymnasium,
@@ -46,7 +46,7 @@ def check_domain(domain: Domain, config: Config | None = None, *, seed: int = 0)
 
 
 def collected(domain: Domain, config: Config | None, seed: int) -> data.Collected:
-    """States of a domain, collected with a config of its; None: with the defaults."""
+    """Return states that a domain collects with ``config``, or with the defaults of its ``config_class`` if None."""
     settings = config or resolve(domain.config_class, stage="collect")
     progress = Progress("check", total=1, quiet=True)
     return domain.collect(settings, seed, progress)
@@ -61,8 +61,8 @@ class _Played:
     seed: int
 
     def gymnasium(self) -> None:
-        """Gymnasium's checker finds nothing, but for rendering, and closing, which makes the environment again."""
-        warnings.filterwarnings("ignore", ".*is different from the unwrapped version")  # wrappers are the point
+        """Gymnasium's checker, which is not asked about rendering and closing, finds no fault."""
+        warnings.filterwarnings("ignore", ".*is different from the unwrapped version")  # wrappers are checked, too
         try:
             check_env(self.domain.make_env(), skip_render_check=True, skip_close_check=True)
         except AssertionError as error:
@@ -94,19 +94,19 @@ class _Played:
             text = f"{len(looks)} observations have {len(seen)} different labels: no classifier can tell them apart"
             warnings.warn(text, stacklevel=1)
         if images.dtype == PICTURE:
-            try:  # members see pictures of any size
+            try:  # a warning only, since members see pictures of any size
                 embedding_for(images.shape[1:], None, AUTO)
             except UserError as error:
                 warnings.warn(f"options cannot be learned from these pictures: {error}", stacklevel=1)
         return f"{images.dtype} {images.shape[1:]}"
 
     def two_engines(self) -> None:
-        """Of the same layout seed: the same actions show the same."""
+        """Two engines of the same layout seed show the same for the same actions."""
         first, second = self.make_engine(), self.make_engine()
         require_same(self.play(first), self.play(second), SEEDED)
 
     def restore(self) -> str | None:
-        """A restored engine goes on as the one whose snapshot it got."""
+        """A restored engine goes on as the engine whose snapshot it got."""
         saved, restored = self.make_engine(), self.make_engine()
         if not saved.resumes:
             warnings.warn("it has no snapshot and restore: training on it cannot be resumed", stacklevel=1)
@@ -119,7 +119,7 @@ class _Played:
         return None
 
     def collect(self) -> str:
-        """Can be stored, fits the domain, the same file for the same seed, of both classes."""
+        """Collected states can be stored, fit the domain, have both classes, and depend on the seed alone."""
         domain = self.domain
         files = []
         with TemporaryDirectory() as folder:
@@ -147,7 +147,7 @@ class _Played:
         return f"{len(labels)} labelled states, positives of each sub-goal: {labels.sum(0)}"
 
     def require_observations(self, name: str, observations: Any, count: int) -> None:
-        """Refuse anything but so many of the domain's observations."""
+        """Refuse anything but ``count`` of the domain's observations."""
         domain = self.domain
         _require_array(name, observations, domain.observation_dtype, count, *domain.observation_shape)
         are_finite = np.isfinite(numbers_of(observations)).all()
@@ -162,7 +162,7 @@ class _Played:
         return self.domain.make_engine(0, COUNT, MAX_STEPS, **arguments)
 
     def play(self, engine: Engine) -> Iterator[dict[str, Any]]:
-        """What an engine shows in each step, by name; the actions are random, the same at every call."""
+        """Yield what an engine shows in each step, by name. The actions are random, and the same at every call."""
         rng = rng_for(self.seed, "check")
         for actions in rng.integers(engine.n_actions, size=(STEPS, COUNT)):
             step = engine.step(actions)
@@ -189,7 +189,7 @@ def _require_step(step: Any) -> None:
 
 
 def require_same(first: Iterator[dict[str, Any]], second: Iterator[dict[str, Any]], do: str) -> None:
-    """Two engines show the same."""
+    """Refuse two engines that do not show the same."""
     for number, (left, right) in enumerate(zip(first, second, strict=True), 1):
         differ = [name for name, values in left.items() if not np.array_equal(values, right[name])]
         promise(not differ, f"{', '.join(differ)} differ in step {number}", do)

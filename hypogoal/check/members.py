@@ -1,4 +1,4 @@
-"""The contracts of member networks, views (what members see) and teachers (what they are told)."""
+"""The contracts of member networks, views (what members see) and teachers (what members are told)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,18 +25,19 @@ from hypogoal.hypotheses.networks import inputs_of
 from hypogoal.hypotheses.training import train
 from hypogoal.observations import PICTURE
 
-FEW = 8  # states
+FEW = 8  # states of a batch
 SMALL: dict[str, Any] = {"members": 2, "steps": 2, "batch_size": 16, "network": "mlp"}
-CLOSE = 1e-4  # between probabilities that are the same up to rounding
+CLOSE = 1e-4  # probabilities this close are equal up to rounding
 ANEW = "Make new layers at every call, with weights from PyTorch's generator."
 
 
 def check_view(
     name: str, domain: Domain | None = None, config: Config | None = None, seed: int = 0
 ) -> Iterator[Verdict]:
-    """Whether a view, by its ``module:Class``, can be learned, used and stored on states of a domain, or of rooms.
+    """Check whether a view, by its ``module:Class``, can be learned, used and stored.
 
-    They are collected with ``config``, an instance of the domain's ``config_class`` (None: the defaults).
+    The states are those of ``domain``, by default of rooms. They are collected with ``config``, an instance of the
+    domain's ``config_class`` (None: the defaults).
     """
     view = _Trained("view", name, domain or load_domain("rooms"), config, seed)
     laws = [_Trained.trains, _Trained.shows, _Trained.is_kept]
@@ -46,14 +47,20 @@ def check_view(
 def check_teacher(
     name: str, domain: Domain | None = None, config: Config | None = None, seed: int = 0
 ) -> Iterator[Verdict]:
-    """Whether a teacher, by its ``module:function``, gives scores that members can learn; as :func:`check_view`."""
+    """Check whether a teacher, by its ``module:function``, gives scores that members can learn.
+
+    The states are as in :func:`check_view`.
+    """
     teacher = _Trained("teacher", name, domain or load_domain("rooms"), config, seed)
     return verdicts([_Trained.trains], teacher)
 
 
 @dataclass
 class _Trained:
-    """A view or a teacher by its setting and name, and where states are collected, whose first sub-goal counts."""
+    """A view or a teacher by its setting and name, and where states are collected.
+
+    Only the first sub-goal of the states counts.
+    """
 
     setting: str
     name: str
@@ -63,11 +70,11 @@ class _Trained:
 
     @cached_property
     def states(self) -> Collected:
-        """Some, with labels and without."""
+        """States of the domain, with labels and without."""
         return collected(self.domain, self.config, self.seed)
 
     def trains(self) -> str:
-        """Members can be trained, the same from the same seed."""
+        """Members can be trained, and are the same when trained again with the same seed."""
         ensemble = self.ensemble()
         again = self.ensemble().state_dict()
         for name, values in ensemble.state_dict().items():
@@ -76,7 +83,7 @@ class _Trained:
         return f"members see {ensemble.view.dtype} {ensemble.view.shape}"
 
     def shows(self) -> None:
-        """Of a state alone the same as of it among others, and as of a batch that is not changed."""
+        """A state alone is shown as among others, and as in a batch that is not changed."""
         view = self.ensemble().view
         few = self.states.labelled.observations[:FEW]
         seen = view.see(few)
@@ -89,7 +96,7 @@ class _Trained:
         promise(is_plain, "without a generator a batch is not what members see", "Change nothing without one.")
 
     def is_kept(self) -> None:
-        """What it learned is in its parameters and buffers."""
+        """What the view learned is in its parameters and buffers."""
         view = self.ensemble().view
         observations = self.states.labelled.observations
         fresh = views.view_of(self.name, (), observations.shape[1:], observations.dtype)
@@ -99,7 +106,7 @@ class _Trained:
         promise(is_same, "what it learned is not loaded", "Keep it in parameters or buffers.")
 
     def ensemble(self) -> Ensemble:
-        """A fresh one, trained."""
+        """Return a newly trained ensemble."""
         labelled, unlabelled = self.states.labelled, self.states.unlabelled
         settings = SMALL | {self.setting: self.name}
         return train(
@@ -115,7 +122,7 @@ class _Trained:
 def check_network(
     name: str, observation_shape: tuple[int, ...] = (64, 64, 3), observation_dtype: np.dtype[Any] = PICTURE
 ) -> Iterator[Verdict]:
-    """Whether a member network, by its ``--set network`` name, can be trained, stored, used and explained."""
+    """Check whether a member network, by its ``--set network`` name, can be trained, stored, used and explained."""
     values = rng_for(0, "check").integers(256, size=(FEW, *observation_shape))
     laws = [_Network.logits, _Network.members, _Network.gradients, _Network.answers, _Network.is_kept]
     return verdicts(laws, _Network(name, values.astype(observation_dtype)))
@@ -135,7 +142,7 @@ class _Network:
         return inputs_of(ensemble.see(self.states))
 
     def logits(self) -> str:
-        """Rows in are rows out, of two logits."""
+        """A member gives two logits for each state."""
         ensemble = self.ensemble()
         member, _ = ensemble.members
         shape = tuple(member(self.inputs(ensemble)).shape)
@@ -147,14 +154,14 @@ class _Network:
         return f"{shape}, explained by {method_of(member)}"
 
     def members(self) -> None:
-        """Their weights come from the seed."""
+        """The members' weights come from the seed."""
         first, second = self.ensemble(), self.ensemble()
         for weights, others in zip(first.parameters(), second.parameters(), strict=True):
             is_same = torch.equal(weights, others)
             promise(is_same, "two ensembles of one seed differ", ANEW)
 
     def gradients(self) -> None:
-        """Every weight that is not frozen learns."""
+        """Every weight that is not frozen gets a gradient."""
         ensemble = self.ensemble()
         member, _ = ensemble.members
         logits = member(self.inputs(ensemble))
@@ -165,7 +172,7 @@ class _Network:
             promise(learns or not weight.requires_grad, fault, "Is it used, not detached?")
 
     def answers(self) -> None:
-        """The same for a state alone and among others, which is different code."""
+        """A state alone and among others, which is different code, has the same probabilities."""
         ensemble = self.ensemble()
         many = ensemble.predict(np.concatenate([self.states] * 40))
         alone = ensemble.predict(self.states[:1])
@@ -175,7 +182,7 @@ class _Network:
         promise(worst < CLOSE, fault, "Use layers that act on each state alone, and neither count nor draw.")
 
     def is_kept(self) -> None:
-        """Stored, and loaded into fresh members, they say the same."""
+        """Members that are stored, and loaded into fresh members, say the same."""
         ensemble, fresh = self.ensemble(), self.ensemble(seed=1)
         kept = stored(ensemble.state_dict(), self.name)
         fresh.load_state_dict(load(kept))

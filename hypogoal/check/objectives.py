@@ -22,7 +22,7 @@ LOG_SPACE = "Compute from log_softmax (logsumexp, logaddexp), not from probabili
 
 
 def check_objective(objective: Objective | str) -> Iterator[Verdict]:
-    """Whether a diversity objective, or that of a name, obeys the laws of training."""
+    """Check whether a diversity objective, given itself or by its name, obeys the laws of training."""
     if isinstance(objective, str):
         objective = load_objective(objective)
     laws = [finite, gradients]
@@ -32,7 +32,7 @@ def check_objective(objective: Objective | str) -> Iterator[Verdict]:
 
 
 def finite(objective: Objective) -> None:
-    """One number for each pair, or for all members; also without states, and where probabilities are 0 or 1."""
+    """The loss and its gradient are finite, also without states, and where probabilities are 0 or 1."""
     for case in CASES:
         loss, gradient = _derived(objective, *case)
         fault = f"{loss.item():.4g}, or a gradient that is not finite, with {case}: {CASE}"
@@ -41,7 +41,7 @@ def finite(objective: Objective) -> None:
 
 
 def gradients(objective: Objective) -> None:
-    """Every member gets one, of the others or of members that were trained before."""
+    """Every member gets a gradient, from the other members or from members that were trained before."""
     least = 0.0
     for frozen in (0, 2) if objective.ensemble_loss else (0,):
         _, gradient = _derived(objective, 3, 7, frozen, 1.0)
@@ -55,9 +55,9 @@ def gradients(objective: Objective) -> None:
 
 
 def disagreement(objective: Objective) -> None:
-    """A pair that differs loses less than one that agrees; Eq. (1) as printed rewards agreement."""
+    """A pair that differs loses less than a pair that agrees, although Eq. (1) as printed rewards agreement."""
     assert objective.pair_loss
-    sure = torch.tensor([[-5.0, 5.0], [5.0, -5.0]])  # of one class, and of the other
+    sure = torch.tensor([[-5.0, 5.0], [5.0, -5.0]])  # logits of a member that is sure of one class, and of the other
     member = sure[[0, 0, 1, 1]]
     agreeing = objective.pair_loss(member, member)
     differing = objective.pair_loss(member, sure[[0, 1, 0, 1]])
@@ -70,9 +70,10 @@ def disagreement(objective: Objective) -> None:
 
 
 def _derived(objective: Objective, members: int, states: int, frozen: int, gap: float) -> tuple[Tensor, Tensor]:
-    """The loss of random members, and its gradient by their logits in 6 labelled and ``states`` unlabelled states.
+    """Return the loss of random members, and its gradient by their logits, (K, 6 + N, 2).
 
-    ``gap`` is the deviation of logits; the gradient (K, 6 + N, 2) is 0 by those that the loss does not depend on.
+    There are 6 labelled and N = ``states`` unlabelled states. ``gap`` is the deviation of logits. The gradient is 0 by
+    logits that the loss does not depend on.
     """
     generator = torch.Generator().manual_seed(3)
     logits = gap * torch.randn(members + frozen, 6 + states, 2, generator=generator)

@@ -1,4 +1,4 @@
-"""The contracts of an agent's parts (:mod:`hypogoal.options.parts`): each is made, played, resumed and kept."""
+"""The contracts of an agent's parts (:mod:`hypogoal.options.parts`): a part is made, played, resumed and kept."""
 
 import warnings
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ from hypogoal.options.termination import Terminations, load_rule
 STEPS = 60  # joint steps
 SMALL = {"environments": 4, "max_episode_steps": 30, "option_timeout": 5, "warm_up": 40, "option_batch": 8}
 SOURCE = {"sub_goals": ("one", "other"), "members": 2, "domain_config": {}}
-PLAYED_AS = {  # settings in a loop
+PLAYED_AS = {  # where a loop has the part of a setting
     "chooser": attrgetter("chooser"),
     "network": attrgetter("learner"),
     "termination": attrgetter("terminations.rule"),
@@ -33,10 +33,10 @@ PLAYED_AS = {  # settings in a loop
 
 
 def check_part(setting: str, name: str, domain: Domain | None = None, seed: int = 0) -> Iterator[Verdict]:
-    """Whether a chooser, an option learner (``network``) or a termination rule, by its ``module:Class``, works.
+    """Check whether a chooser, an option learner (``network``) or a termination rule, by its ``module:Class``, works.
 
-    It is played for some steps, in DoorKey by default, beside built-in parts. Four options aim at made-up sub-goals,
-    each of which holds in a third of the states.
+    The part is played for some steps, in DoorKey by default, beside built-in parts. Four options aim at made-up
+    sub-goals, each of which holds in a third of the states.
     """
     part = _PlayedPart(setting, name, domain or load_domain("doorkey"), seed)
     laws = [
@@ -58,19 +58,19 @@ class _PlayedPart:
     seed: int
 
     def plays(self) -> str:
-        """Its answers are of the shapes, types and ranges that are asked for, at every step."""
+        """The part's answers have the shapes, types and ranges that are asked for, at every step."""
         recorder = self.played().recorder
         if self.setting == "termination" and not any(recorder.stops):
             warnings.warn(f"no option reached its sub-goal in {recorder.steps} steps", stacklevel=1)
         return f"{recorder.steps} steps"
 
     def again(self) -> None:
-        """Of the same seed: the same is played."""
+        """The same seed plays the same."""
         first, second = self.loop(), self.loop()
         require_same(_play(first), _play(second), SEEDED)
 
     def resumes(self) -> str | None:
-        """From a checkpoint it goes on as if there had been no break."""
+        """From a checkpoint, play goes on as if there had been no break."""
         loop, resumed = self.played(), self.loop()
         if not loop.engine.resumes:
             return "not looked at: this domain cannot be resumed"
@@ -85,7 +85,7 @@ class _PlayedPart:
         return None
 
     def is_kept(self) -> str:
-        """What an artefact keeps of it, a fresh one loads."""
+        """A fresh part loads what an artefact keeps of the part."""
         part = self.part(self.played())
         kept = {name: torch.as_tensor(values) for name, values in part.state().items()}
         fresh = self.part(self.loop())
@@ -96,18 +96,18 @@ class _PlayedPart:
         return f"{len(kept)} arrays"
 
     def played(self) -> OptionLoop:
-        """It and other parts, after some steps."""
+        """Return a loop with the part and other parts, after some steps."""
         loop = self.loop()
         for _ in _play(loop):
             pass
         return loop
 
     def part(self, loop: OptionLoop) -> Any:
-        """The part that is checked."""
+        """Return the checked part of a loop."""
         return PLAYED_AS[self.setting](loop)
 
     def loop(self) -> OptionLoop:
-        """It and other parts, fresh."""
+        """Return a fresh loop with the part and other parts."""
         settings = SMALL | {"network": "light", "chooser": "random", self.setting: self.name}
         config = TrainMetaConfig.of(**settings)
         setup = Setup(self.domain, SOURCE, Path(), config, self.seed)
@@ -115,7 +115,7 @@ class _PlayedPart:
 
 
 def _made_up(setup: Setup, engine: Engine) -> Terminations:
-    """Terminations of sub-goals that depend on the state's number alone."""
+    """Return terminations of sub-goals that depend on the state's number alone."""
     rule = load_rule(setup.config.termination)
     rule.refuse(setup.config, engine)
     if engine.observation_dtype != PICTURE:
@@ -130,7 +130,7 @@ def _made_up(setup: Setup, engine: Engine) -> Terminations:
 
 
 def _play(loop: OptionLoop) -> Iterator[dict[str, Any]]:
-    """What every step leads to."""
+    """Yield what every step leads to."""
     for _ in range(STEPS):
         loop.step()
         yield {"options": loop.option.copy(), "states": loop.engine.ids.copy()}

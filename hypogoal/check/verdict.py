@@ -1,4 +1,4 @@
-"""What a check finds: a verdict on each law, up to the first that is broken, since later ones build on it."""
+"""What a check finds: a verdict on each law, up to the first broken one, since later laws build on earlier ones."""
 
 import re
 import warnings
@@ -9,7 +9,7 @@ from typing import Any
 from hypogoal.core.errors import UserError
 from hypogoal.core.own_code import message
 
-COLOUR = re.compile(r"\x1b\[[\d;]*m")  # of a terminal's text, as Gymnasium's warnings have
+COLOUR = re.compile(r"\x1b\[[\d;]*m")  # colours of a terminal, which Gymnasium's warnings have
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class Verdict:
     """Whether a law is kept.
 
     Attributes:
-        name: of the law.
-        ok: whether it is kept.
-        text: what was seen; of a broken law what is wrong, where, and what to do.
+        name: the name of the law.
+        ok: whether the law is kept.
+        text: what was seen. Of a broken law: what is wrong, where, and what to do.
         warnings: what is allowed but may surprise.
     """
 
@@ -30,28 +30,29 @@ class Verdict:
 
     @property
     def lines(self) -> list[str]:
-        """As ``hypogoal check`` prints it."""
+        """The lines that ``hypogoal check`` prints."""
         verdict = f"{'ok  ' if self.ok else 'FAIL'} {self.name}: {self.text}"
         return [verdict, *(f"warn {self.name}: {text}" for text in self.warnings)]
 
 
 def promise(kept: object, fault: str, do: str) -> None:
-    """Raise a ``UserError`` unless a promise is ``kept``."""
+    """Raise ``UserError`` unless a promise is ``kept``."""
     if not kept:
         raise UserError(fault, do=do)
 
 
 def verdicts(laws: Iterable[Callable[[Any], str | None]], subject: Any) -> Iterator[Verdict]:
-    """The verdict on each law, a function of what is checked that raises what is wrong.
+    """Yield the verdict on each law, up to the first broken one.
 
-    It may return what it saw; else what its docstring says is so.
+    A law is a function of what is checked, and raises what is wrong. It may return what it saw. Otherwise, the text of
+    the verdict is the law's docstring.
     """
     for law in laws:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
                 ok, text = True, law(subject) or str(law.__doc__)
-            except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code raises
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - the checked code may raise anything
                 ok, (text, _) = False, message(error)
         texts = dict.fromkeys(COLOUR.sub("", str(warning.message)) for warning in caught)
         yield Verdict(law.__name__.replace("_", " "), ok, text, tuple(texts))
@@ -60,6 +61,6 @@ def verdicts(laws: Iterable[Callable[[Any], str | None]], subject: Any) -> Itera
 
 
 def require(results: Iterable[Verdict]) -> None:
-    """For a test suite: raise an ``AssertionError`` that says which law is broken, if one is."""
+    """Raise ``AssertionError``, which says what law is broken, if there is one. This is for a test suite."""
     for verdict in results:
         assert verdict.ok, "\n".join(verdict.lines)

@@ -1,4 +1,4 @@
-"""One call of a stage: what it was asked for, the output that it fills, what it says at its end."""
+"""One call of a stage: what it was asked for, the output that it fills, and what it says at its end."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Place = str | os.PathLike[str]
 DOMAINS = "doorkey, montezuma, rooms, or your own as module:object."
-# Options that stages leave out which do not train, or have no settings.
+# Options that stages leave out if they do not train, or have no settings.
 NO_TRAINING = ("device", "tensorboard")
 NO_SETTINGS = ("preset", "seed", *NO_TRAINING)
 
@@ -37,7 +37,7 @@ Tensorboard = Annotated[Path | None, Option("--tensorboard", metavar="DIR", help
 
 @dataclass(frozen=True, kw_only=True)
 class Call:
-    """One call of a stage: where it writes, and how it was asked for. What follows ``typed`` are options."""
+    """One call of a stage: where it writes, and how it was asked for. The fields after ``typed`` are options."""
 
     stage: str
     out: Out
@@ -51,7 +51,7 @@ class Call:
     quiet: Quiet = False
 
     def settings(self, kind: type["C"], domain: str, inherited: Mapping[str, Any] | None = None) -> "C":
-        """The stage's settings: defaults, the domain's, the preset's, those of continued options, the typed ones."""
+        """Return the stage's settings: defaults, the domain's, the preset's, those of continued options, typed ones."""
         from hypogoal.domains.base import settings_of
 
         return settings_of(kind, self.stage, domain, self.preset, self.typed, inherited=inherited)
@@ -62,7 +62,7 @@ class Call:
         config: Mapping[str, Any],
         inputs: Sequence[Path] = (),
     ) -> contextlib.AbstractContextManager["Draft"]:
-        """The output to fill, see :func:`hypogoal.core.artefacts.create`."""
+        """Return the output to fill, see :func:`hypogoal.core.artefacts.create`."""
         from hypogoal.core.artefacts import create
 
         return create(
@@ -83,7 +83,7 @@ class Call:
         inputs: Sequence[Path],
         steps: int,
     ) -> Iterator["Training"]:
-        """The same for a training of so many steps, with a log."""
+        """Give the output to fill, with a log and a progress bar, for a training of ``steps`` steps."""
         from hypogoal.core.artefacts import LOG
 
         with (
@@ -96,7 +96,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Training:
-    """An artefact in training: its draft, its log, its progress bar."""
+    """An artefact in training: its draft, its log, and its progress bar."""
 
     draft: "Draft"
     log: MetricsLog
@@ -110,12 +110,15 @@ class Done:
     lines: Sequence[str] = ()
     path: Path | None = None  # where to look, if not at the output or its page
     then: str = ""  # the next command, if not the stage's
-    told: str = ""  # a line for programs, in the place of all that
-    code: int = 0  # what the command exits with
+    told: str = ""  # a line for programs, printed in place of lines, path and then
+    code: int = 0  # the command's exit code
 
 
 def outcome_of(numbers: Mapping[str, Any]) -> list[str]:
-    """The results of training as a line. NaN (no episode has ended) is left out: the number of episodes says it too."""
+    """Return the results of training as a line.
+
+    NaN, which means that no episode has ended, is left out, because the number of episodes says it, too.
+    """
     texts = []
     for name, value in numbers.items():
         text = f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,9 +1,9 @@
-"""A stage is one function: from it come a command and a Python function of the same name. Tools are made so, too.
+"""A stage is one function, which becomes a command and a Python function of the same name. So does a tool.
 
 ``@stage(...)`` makes of ``train_meta(call, ensemble, *, options=None)`` the command ``hypogoal train-meta ENSEMBLE
 --options PATH --out OUT`` and the function ``hypogoal.train_meta(ensemble, out, options=...)``, with the same
-arguments, settings and checks. What takes time to import is imported when it is called, so that ``--help`` is quick;
-``LISTED`` has every stage and tool by the name of its command.
+arguments, settings and checks. What takes time to import is imported when the function is called, so that ``--help`` is
+quick. ``LISTED`` has every stage and tool by the name of its command.
 """
 
 import functools
@@ -26,7 +26,7 @@ from hypogoal.core.progress import say
 if TYPE_CHECKING:
     from hypogoal.look import Made
 
-LISTED = {  # every stage and tool in a line, after those whose outputs it reads; it is loaded when it is called
+LISTED = {  # every stage and tool, after those whose outputs it reads; loaded when it is called
     "collect": "Collect labelled, unlabelled and held-out states.",
     "import": "Make a data file of your arrays, pictures or recorded episodes.",
     "train-ensemble": "Train diverse classifiers (members) for each sub-goal.",
@@ -46,21 +46,22 @@ Set = Annotated[list[str] | None, Option("--set", metavar="KEY=VALUE", help=SET)
 
 
 def stage(example: str, **more: Any) -> Callable[[Callable[..., Done]], Callable[..., "Made"]]:
-    """Make a function a stage, its attribute ``stage``; ``example`` and ``more`` are of :class:`Stage`."""
+    """Return a decorator that makes a function a stage. ``example`` and ``more`` are attributes of :class:`Stage`."""
     return lambda function: Stage(function, example, **more).python()
 
 
 @dataclass
 class Stage:
-    """A function as a stage. It gets a :class:`Call`, then what it works on, then inputs of its own by name.
+    """A function as a stage. It gets a :class:`Call`, then what it works on, then its own inputs by name.
 
     Attributes:
         function: the function.
         example: a command, with which ``--help`` ends.
-        often: the settings changed most, options of the command.
-        leaves_out: options of all stages that this one has not.
-        then: the next command, in which ``{source}``, ``{out}``, ``{run}`` are what it worked on, wrote, and in what.
-        into: what it writes by default, a name within what it works on.
+        often: the settings that are changed most, which are options of the command.
+        leaves_out: options of all stages that this stage does not have.
+        then: the next command. ``{source}`` is what the stage worked on, ``{out}`` the output, ``{run}`` the output's
+            folder.
+        into: the default output, a name within what the stage works on.
     """
 
     function: Callable[..., Done]
@@ -81,7 +82,7 @@ class Stage:
             self.out = self.out.replace(default=None, annotation=Annotated[Path | None, by_default])
 
     def python(self) -> Callable[..., "Made"]:
-        """The function of Python: arguments that are neither inputs nor options are settings."""
+        """Return the Python function. Its arguments that are neither inputs nor options are settings."""
 
         @functools.wraps(self.function)
         def called(source: Any, out: Place | None = None, **arguments: Any) -> "Made":
@@ -129,13 +130,13 @@ class Stage:
         return typer.main.get_command(alone)
 
     def parsed(self, words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The arguments and options in the words of its command, and the settings that they give; nothing is run."""
+        """Return the arguments and options in a command's words, and the settings that they give. Nothing is run."""
         with self.command.make_context(self.name, [*words]) as context:
             values = dict(context.params)
         return values, self._typed(values)
 
     def _typed(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Take the settings out of the ``values`` of options; ``--set`` wins."""
+        """Remove the settings from the ``values`` of options, and return them. ``--set`` wins."""
         from hypogoal.core.config import assigned
 
         chosen = {name: values.pop(name) for name in self.often}
@@ -143,7 +144,7 @@ class Stage:
         return typed | assigned(values.pop("set_", None) or ())
 
     def _settings(self) -> Iterator[Parameter]:
-        """``--set``, and options that are short for it; their values stay text, read as those of ``--set``."""
+        """Yield ``--set``, and the options that are short for it. Their values stay text, which is read later."""
         from hypogoal.core.config import described, model_of
 
         if "preset" in self.leaves_out:
@@ -167,7 +168,10 @@ class Stage:
         values: dict[str, Any],
         typed: Mapping[str, Any],
     ) -> tuple[Call, Done]:
-        """Call the function with the ``values`` of inputs and options. With ``resume`` what is complete is kept."""
+        """Call the function with the ``values`` of inputs and options. Return the call, and what the function returned.
+
+        With ``resume``, a complete output is kept.
+        """
         if typed and "preset" in self.leaves_out:
             raise UserError(f"{self.name} has no settings", ", ".join(typed), "Leave them out.")
         inputs = {each.name: values.pop(each.name) for each in self.inputs}
@@ -185,7 +189,7 @@ class Stage:
 
 
 def load_stage(name: str) -> Stage:
-    """The stage of a command; an unknown one is a ``UserError``."""
+    """Return the stage of a command. Raises ``UserError`` if there is no such stage."""
     if name not in LISTED:
         raise UserError("this is no stage", name, f"Choose one of {', '.join(LISTED)}.")
     folder = "tools" if name in TOOLS else "stages"
@@ -195,7 +199,7 @@ def load_stage(name: str) -> Stage:
 
 
 def _kept(call: Call, then: str) -> Iterator[str]:
-    """The preset and the typed settings of the world that hold for the next stage as well."""
+    """Yield the preset and the typed settings of the world, which hold for the next stage as well."""
     from hypogoal.core.config import STAGES, model_of
     from hypogoal.domains.world import WorldConfig
 
@@ -210,7 +214,7 @@ def _kept(call: Call, then: str) -> Iterator[str]:
 
 
 def _as_path(parameter: Parameter, value: Any) -> Any:
-    """What Python gives for a path: a text, a path or what a stage made; or several."""
+    """Return what Python gave for a path (a text, a path or what a stage made, or several of these) as paths."""
     if value is None or "Path" not in str(parameter.annotation):
         return value
     several = isinstance(value, Iterable) and not isinstance(value, str)

@@ -1,4 +1,4 @@
-"""The interface of a domain, and how to find one by name."""
+"""The interface of a domain, and how a domain is found by its name."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ BUILT_IN = {
 }
 ENTRY_POINTS = "hypogoal.domains"
 REGISTERED: dict[str, Domain] = {}  # domains that the running program defined, by name
-EQUATION_1 = {"schedule": "simultaneous", "restarts": 1, "share": "labels"}  # of train-ensemble, beside the weight
-IMPORTED = "imported"  # the domain of states that 'hypogoal import' got without --domain
+EQUATION_1 = {"schedule": "simultaneous", "restarts": 1, "share": "labels"}  # for train-ensemble, beside the weight
+IMPORTED = "imported"  # the name of the domain of states that 'hypogoal import' got without --domain
 
 
 class Step(NamedTuple):
@@ -38,10 +38,10 @@ class Step(NamedTuple):
     Attributes:
         next_ids: int64 (E,), the states reached, before any automatic reset.
         rewards: float32 (E,).
-        terminated: bool (E,), the task is over.
-        truncated: bool (E,), the step limit ended the episode.
-        succeeded: bool (E,), the episode is over and a success, where the domain defines success. None: an episode
-            succeeds when it terminates with a sum of rewards above 0.
+        terminated: bool (E,), whether the task is over.
+        truncated: bool (E,), whether the step limit ended the episode.
+        succeeded: bool (E,), whether the episode is over and a success, if the domain defines success. None: an episode
+            succeeds if it terminates with a sum of rewards above 0.
     """
 
     next_ids: Ints
@@ -52,18 +52,20 @@ class Step(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The transitions between the states reachable from the start."""
+    """The transitions between the states that can be reached from the start."""
 
     ids: Ints  # (N,), the states
     actions: Ints  # (A,), the actions considered
     following: Ints  # (N, A), the state after each action, one of ``ids``
-    final: Bools  # (N,), the episode ends there, so nothing follows
-    solved: Bools  # (N,), it ends there with the task solved
+    final: Bools  # (N,), whether the episode ends in the state
+    solved: Bools  # (N,), whether the episode ends in the state with the task solved
 
 
 class Layouts(Resumable):
-    """The layout each episode begins in: one of ``seeds``, drawn by ``rng`` for every episode; without ``rng``,
-    environment e always begins in seed number e (modulo their count).
+    """The layouts in which episodes begin.
+
+    For every episode ``rng`` draws one of ``seeds``. Without ``rng``, environment e always begins in seed number e,
+    modulo the number of seeds.
 
     Attributes:
         now: the layout seeds of the environments' current episodes.
@@ -76,31 +78,32 @@ class Layouts(Resumable):
         self.now: list[int] = []
 
     def begin(self, number: int) -> int:
-        """The layout seed of a new episode in environment ``number``."""
+        """Begin an episode in environment ``number``. Return the episode's layout seed."""
         place = number if self.rng is None else int(self.rng.integers(len(self.seeds)))
         seed = self.seeds[place % len(self.seeds)]
-        self.now[number : number + 1] = [seed]  # environments begin in their order, so that the list grows
+        self.now[number : number + 1] = [seed]  # the list grows, because environments first begin in their order
         return seed
 
 
 class Engine(Resumable, ABC):
-    """Many environments, of one layout or several, stepped together; every distinct state has an integer id.
+    """Many environments, of one layout or several, that are stepped together. Every distinct state has an integer id.
 
-    Required members come first, then optional ones with their defaults.
+    Required members come first, then optional members with their defaults.
 
     Attributes:
-        n_actions: primitive actions are 0 .. n_actions - 1.
-        count: environments (E).
+        n_actions: the number of primitive actions, which are 0 .. n_actions - 1.
+        count: the number of environments (E).
         observation_shape, observation_dtype: uint8 (H, W, C) for pictures, or float32 of any shape, or mixed.
-        standard: mean and deviation with which agents standardise float32 observations; set in training.
-        max_steps: steps after which an episode is truncated.
+        standard: mean and deviation with which agents standardise float32 observations. Training sets them.
+        max_steps: the number of steps after which an episode is truncated.
         ids: int64 (E,), the current state of each environment.
-        elapsed: int64 (E,), steps since its episode began.
-        memory: it can draw at least this many of the latest states, and forgets older frames. None: it can draw all.
-        starts: its start states, with ids 0 .. S - 1, never forgotten; empty where all episodes begin alike.
-        position_names: the columns of :meth:`positions`; empty if the agent's position is unknown.
-        layouts: where episodes begin; None: all in one layout.
-        restarts: whether it has :meth:`restart`, or what this needs.
+        elapsed: int64 (E,), the number of steps since the environment's episode began.
+        memory: the number of latest states that can at least be drawn. Frames of older states are forgotten. None: all
+            states can be drawn.
+        starts: the start states, with ids 0 .. S - 1, which are never forgotten. Empty: all episodes begin alike.
+        position_names: the names of the columns of :meth:`positions`. Empty: the agent's position is unknown.
+        layouts: the layouts in which episodes begin. None: all episodes begin in one layout.
+        restarts: whether :meth:`restart` works, because the engine defines it or ``_begin``.
         resumes: whether :meth:`snapshot` has all that the next steps need.
     """
 
@@ -123,33 +126,33 @@ class Engine(Resumable, ABC):
     @property
     @abstractmethod
     def n_states(self) -> int:
-        """Ids assigned so far are 0 .. n_states - 1."""
+        """The number of ids assigned so far, which are 0 .. n_states - 1."""
 
     def reset(self) -> Ints:
-        """Begin a new episode in every environment; returns the ids, int64 (E,). Uses ``restart`` by default."""
+        """Begin a new episode in every environment. Return the ids, int64 (E,). By default this uses ``restart``."""
         self.ids = self.elapsed = np.zeros(self.count, int)
         self.restart(np.ones(self.count, bool))
         return self.ids.copy()
 
     @abstractmethod
     def step(self, actions: Ints) -> Step:
-        """Step every environment with actions (E,); where an episode ends, ``ids`` becomes a start state."""
+        """Step every environment with actions (E,). Where an episode ends, ``ids`` becomes a start state."""
 
     @abstractmethod
     def images(self, ids: Ints) -> Observations:
-        """Observations (n, *observation_shape), ``observation_dtype``, of known states, in an array of their own."""
+        """Return the observations of known states, ``observation_dtype`` (n, *observation_shape), in a new array."""
 
     @abstractmethod
     def labels(self, ids: Ints) -> Bools:
-        """True sub-goal predicates, bool (n, G): an oracle, for evaluation and the upper bound only."""
+        """Return whether each sub-goal truly holds in states, bool (n, G), for evaluation and the upper bound only."""
 
     def restart(self, where: Bools) -> None:
-        """Begin a new episode in the environments ``where``, bool (E,); needs ``restarts``. Uses ``_begin`` by default.
+        """Begin a new episode in the environments ``where``, bool (E,). By default this uses ``_begin``.
 
-        The arrays of before stay as they are.
+        The engine must have ``restarts``. ``ids`` and ``elapsed`` become new arrays, so the old arrays do not change.
         """
         [numbers] = where.nonzero()
-        if not len(numbers):  # in most steps
+        if not len(numbers):  # as in most steps
             return
         self.ids = self.ids.copy()
         self.elapsed = np.where(where, 0, self.elapsed)
@@ -157,60 +160,60 @@ class Engine(Resumable, ABC):
             self.ids[number] = self._begin(number)
 
     def _begin(self, number: int) -> int:
-        """Begin an episode in one environment; returns the start state."""
+        """Begin an episode in one environment. Return the start state."""
         raise NotImplementedError
 
     @property
     def oldest(self) -> int:
-        """Ids below this one, except start states, are forgotten and can no longer be drawn."""
+        """The id below which states, except start states, are forgotten and can no longer be drawn."""
         return 0
 
     def remembers(self, ids: NDArray[np.integer]) -> Bools:
-        """Whether these states (...,) can still be drawn."""
+        """Return whether states (...,) can still be drawn, bool (...,)."""
         return (ids >= self.oldest) | (ids < len(self.starts))
 
     def positions(self, ids: Ints) -> Ints:
-        """The agent's positions, int64 (n, ``position_names``), also in forgotten states."""
+        """Return the agent's positions in states, int64 (n, ``position_names``), also in forgotten states."""
         raise NotImplementedError
 
     @property
     def tiles(self) -> Bytes | None:
-        """The picture of each cell code, uint8 (codes, height, width, C); None if pictures are not made of cells."""
+        """The picture of each cell code, uint8 (codes, height, width, C), or None if pictures are not made of cells."""
         return None
 
     def codes(self, ids: Ints) -> Bytes:
-        """The cell codes of states, uint8 (n, cells); needs ``tiles``."""
+        """Return the cell codes of states, uint8 (n, cells). The engine must have ``tiles``."""
         raise NotImplementedError
 
     def reachable(self) -> Ints | None:
-        """Ids of all reachable states, one for each distinct image; None if unknown."""
+        """Return the ids of all reachable states, one for each distinct image, or None if they are unknown."""
         return None
 
     def plan(self, starts: Ints | None = None) -> Plan | None:
-        """The state each action leads to from each state that can be reached; None if unknown.
+        """Return where each action leads from each state that can be reached, or None if that is unknown.
 
-        From these ``starts``, ids (n,), or from where episodes begin.
+        The states are those that can be reached from ``starts``, ids (n,), or from where episodes begin.
         """
         return None
 
     def shortest_path(self) -> int | None:
-        """The fewest primitive steps that solve the task; None if unknown."""
+        """Return the fewest primitive steps that solve the task, or None if the number is unknown."""
         return None
 
     def random_success(self, episodes: int, rng: Generator) -> float | None:
-        """The share of episodes of uniform-random actions that solve the task; None if not measured."""
+        """Return the share of episodes of uniformly random actions that solve the task, or None if not measured."""
         return None
 
 
 class TurnEngine(Engine):
-    """An engine that steps its environments one after the other, and keeps what it saw in the newest states.
+    """An engine that steps its environments one after the other, and keeps what was seen in the newest states.
 
-    Subclasses begin an episode and play a step. In plain Python, because NumPy's operations slow down an emulator's
-    next frames, see ``montezuma.emulator``.
+    Subclasses define how an episode begins and how a step is played. A step is in plain Python, because NumPy's
+    operations slow down an emulator's next frames (see ``montezuma.emulator``).
 
     Attributes:
-        room: the number of states, besides start states, of which it keeps what it saw.
-        width: of how many bytes the facts are that it keeps of every state.
+        room: the number of states, besides start states, of which is kept what was seen.
+        width: the number of bytes of the facts that are kept of every state.
     """
 
     restarts = resumes = True
@@ -218,7 +221,7 @@ class TurnEngine(Engine):
     width: int
 
     def __init__(self) -> None:
-        self._seen: dict[int, Any] = {}  # by state, in order
+        self._seen: dict[int, Any] = {}  # what was seen, by state, in the order of states
         self._facts = bytearray()
 
     @property
@@ -231,11 +234,11 @@ class TurnEngine(Engine):
 
     @property
     def kept(self) -> list[int]:
-        """The states of which it keeps what it saw, in order."""
+        """The states of which is kept what was seen, in order."""
         return [*range(len(self.starts)), *range(self.oldest, self.n_states)]
 
     def _add(self, seen: Any, facts: bytes) -> int:
-        """Keep what was seen in a new state, and its facts; returns its id."""
+        """Keep what was seen in a new state, and the state's facts. Return the state's id."""
         state = self.n_states
         self._seen[state] = seen
         self._facts += facts
@@ -245,12 +248,12 @@ class TurnEngine(Engine):
         return state
 
     def read_facts(self, ids: Ints | Sequence[int]) -> Bytes:
-        """The facts of states, uint8 (n, ``width``), also of forgotten ones."""
+        """Return the facts of states, uint8 (n, ``width``), also of forgotten states."""
         every = np.frombuffer(self._facts, np.uint8)
         return every.reshape(-1, self.width)[ids]
 
     def images(self, ids: Ints) -> Observations:
-        """See ``Engine``; ``ValueError`` if a state is unknown or forgotten."""
+        """Return observations as ``Engine.images`` does. Raises ``ValueError`` if a state is unknown or forgotten."""
         images = np.empty((len(ids), *self.observation_shape), self.observation_dtype)
         for row, state in enumerate(ids.tolist()):
             if state not in self._seen:
@@ -259,7 +262,7 @@ class TurnEngine(Engine):
         return images
 
     def _image(self, seen: Any) -> Any:
-        """The observation of what was seen."""
+        """Return the observation of a state, made of what was seen in the state."""
         return seen
 
     def snapshot(self) -> State:
@@ -271,7 +274,7 @@ class TurnEngine(Engine):
 
     @abstractmethod
     def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
-        """Step ``elapsed`` of one environment's episode: what a :class:`Step` says of it."""
+        """Play step number ``elapsed`` of one environment's episode. Return the environment's entries of a ``Step``."""
 
     def step(self, actions: Ints) -> Step:
         elapsed = [steps + 1 for steps in self.elapsed.tolist()]
@@ -290,21 +293,24 @@ class TurnEngine(Engine):
 
 
 class Domain(ABC, Generic[C]):
-    """What hypogoal needs to know about a domain; :class:`hypogoal.GymnasiumDomain` makes one from an environment.
+    """All that hypogoal needs to know about a domain.
 
-    ``hypogoal check`` tests it. Required members come first, then optional ones.
+    :class:`hypogoal.GymnasiumDomain` makes a domain of an environment, and ``hypogoal check`` tests a domain. Required
+    members come first, then optional members.
 
     Attributes:
-        name: for messages.
-        sub_goals: their names (G); ``collect`` may label some of them.
+        name: the domain's name in messages.
+        sub_goals: the names of the sub-goals (G). ``collect`` may label some of them.
         config_class: the settings of ``collect``, a ``Config`` of ``core.config.setting`` fields.
-        engine_settings: the names of the settings that define the world; later stages play with them too.
-        defaults: by stage, settings that suit the domain; sources: by stage, where they come from, if known.
-        env_id: the id of its registered Gymnasium environment, if any.
-        starts: names of places where episodes begin; ``make_engine`` takes one as ``start``.
-        many_layouts: ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
-        measures: it has :meth:`distance_to`; near: the distance up to which a state counts as near a true sub-goal.
-        pictures: it has :meth:`picture` and :meth:`pixel`.
+        engine_settings: the names of the settings that define the world. Later stages play with these settings, too.
+        defaults: by stage, settings that suit the domain.
+        sources: by stage, where the ``defaults`` come from, if that is known.
+        env_id: the id of the domain's registered Gymnasium environment, if any.
+        starts: the names of places where episodes begin. ``make_engine`` takes a name as ``start``.
+        many_layouts: whether ``make_engine`` also takes ``layouts``, the :class:`Layouts` to begin episodes in.
+        measures: whether the domain has :meth:`distance_to`.
+        near: the distance up to which a state counts as near a true sub-goal.
+        pictures: whether the domain has :meth:`picture` and :meth:`pixel`.
     """
 
     name: str
@@ -322,28 +328,31 @@ class Domain(ABC, Generic[C]):
     @property
     @abstractmethod
     def observation_shape(self) -> Shape:
-        """(H, W, C) for pictures, any shape for other observations."""
+        """The shape of an observation, (H, W, C) for pictures, and any shape for other observations."""
 
     @property
     def observation_dtype(self) -> DType:
-        """uint8 for pictures, float32 for other observations."""
+        """The type of an observation, uint8 for pictures, float32 for numbers, or a structured type if mixed."""
         return PICTURE
 
     @abstractmethod
     def collect(self, config: C, seed: int, progress: Any) -> Collected:
-        """Labelled, unlabelled and held-out states."""
+        """Collect labelled, unlabelled and held-out states."""
 
     @abstractmethod
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> Engine:
-        """An engine of ``count`` environments of one layout; ``arguments``: ``engine_settings`` and ``start``."""
+        """Return an engine of ``count`` environments of one layout.
+
+        ``arguments`` are settings among ``engine_settings``, and ``start``.
+        """
 
     @property
     def has_env(self) -> bool:
-        """Whether it has a Gymnasium environment."""
+        """Whether the domain has a Gymnasium environment."""
         return bool(self.env_id)
 
     def make_env(self, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """Its Gymnasium environment."""
+        """Return the domain's Gymnasium environment. Raises ``UserError`` if there is none."""
         import gymnasium
 
         if not self.has_env:
@@ -351,42 +360,47 @@ class Domain(ABC, Generic[C]):
         return gymnasium.make(self.env_id, **arguments)
 
     def world(self, config: Values) -> dict[str, Any]:
-        """The engine settings among ``config``, the settings that states were collected with.
+        """Return the engine settings among ``config``, the settings with which states were collected.
 
         ``config`` is that of a data file, or ``domain_config`` of an artefact. Missing settings are left to
-        ``make_engine``; values that ``collect`` would refuse are a ``UserError``.
+        ``make_engine``. Raises ``UserError`` if ``collect`` would refuse a value.
         """
         values = {name: config[name] for name in self.engine_settings if name in config}
         checked = resolve(self.config_class, values, stage="collect") if values else None
         return {name: getattr(checked, name) for name in values}
 
     def task(self, world: Values) -> str:
-        """What is rewarded and what ends an episode, in a sentence or two for people.
+        """Say in a sentence or two, for people, what is rewarded and what ends an episode.
 
-        ``world``: as of :meth:`world`; settings that it lacks have their defaults.
+        ``world`` is what :meth:`world` returns. Missing settings have their defaults.
         """
         return f"The reward and the end of an episode are those of the domain '{self.name}'."
 
     def distance_to(self, sub_goal: str, positions: Ints) -> Ints:
-        """The distance from positions to the nearest place where a sub-goal holds, int (n,); needs ``measures``."""
+        """Return the distance from positions to the nearest place where a sub-goal holds, int (n,).
+
+        The domain must have ``measures``.
+        """
         raise NotImplementedError
 
     def picture(self, room: int) -> Bytes:
-        """A picture of a room, uint8 (height, width, 3); needs ``pictures``."""
+        """Return a picture of a room, uint8 (height, width, 3). The domain must have ``pictures``."""
         raise NotImplementedError
 
     def pixel(self, positions: Ints) -> Doubles:
-        """The column and row of positions in that picture, (n, 2); needs ``pictures``."""
+        """Return the column and row of positions in the room's picture, (n, 2). The domain must have ``pictures``."""
         raise NotImplementedError
 
 
 def load_domain(name: str) -> Domain:
-    """A domain by name: a built-in one, an installed entry point (group ``hypogoal.domains``) or ``module:object``.
+    """Load a domain by name.
 
-    Code that the user did not allow (see :mod:`hypogoal.core.own_code`), or an object that is no domain, is a
-    ``UserError``. What a domain of one's own has as defaults, such as a network, may be loaded with it.
+    The name is that of a built-in domain, of an installed entry point (group ``hypogoal.domains``), or
+    ``module:object``. The user's own code that the domain's defaults name, such as a network, is allowed together with
+    the domain. Raises ``UserError`` if the user did not allow the domain's code (see :mod:`hypogoal.core.own_code`), or
+    if the object is no domain.
     """
-    name = "rooms" if name == "which-feature" else name  # so called in files of 0.23
+    name = "rooms" if name == "which-feature" else name  # the name of rooms in files of version 0.23
     domain = REGISTERED.get(name)
     if domain is None and name == IMPORTED:
         raise UserError(
@@ -403,7 +417,10 @@ def load_domain(name: str) -> Domain:
 
 
 def installed_domain(name: str) -> Domain | None:
-    """The domain, or None if it is not installed: a user's data may name such a one. See :func:`load_domain`."""
+    """Return a domain as :func:`load_domain` does, or None if it cannot be loaded.
+
+    A user's data may name a domain that is not installed. Raises ``UserError`` if the user did not allow the code.
+    """
     own_code.require_trust(name, "domain")
     try:
         return load_domain(name)
@@ -412,7 +429,10 @@ def installed_domain(name: str) -> Domain | None:
 
 
 def layers_of(stage: str, domain: str, preset_name: str | None) -> list[tuple[Values, str]]:
-    """What replaces the defaults of a stage's settings, and its source: the domain's own, then a preset's."""
+    """Return the values that replace the defaults of a stage's settings, with their source, in order.
+
+    The domain's own values come first, then those of a preset.
+    """
     installed = installed_domain(domain)
     layers = []
     if installed:
@@ -429,9 +449,11 @@ def settings_of(
     *,
     inherited: Values | None = None,
 ) -> C:
-    """The settings of a stage on a domain: its defaults, a preset's, those ``inherited``, then what the user typed.
+    """Return the settings of a stage on a domain.
 
-    ``inherited`` are of the options that the stage continues. What is unknown or not allowed is a ``UserError``.
+    The domain's values replace the defaults. Then follow a preset's values, then ``inherited``, the settings of the
+    options that the stage continues, and then what the user ``typed``. Raises ``UserError`` if a name is unknown, or if
+    a value is not allowed.
     """
     model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
     layers = [values for values, _ in layers_of(stage, domain, preset_name)]

@@ -1,4 +1,4 @@
-"""The episodes played so far: how long each was, what it earned, how it ended."""
+"""A record of the episodes played so far, with their length, their reward, and how they ended."""
 
 from __future__ import annotations
 
@@ -14,35 +14,37 @@ from hypogoal.core.checkpoints import Resumable
 if TYPE_CHECKING:
     from hypogoal.domains.base import Step
 
-LAST = 100  # an agent is judged by its last so many episodes, an option by its last so many executions
+LAST = 100  # the number of last episodes by which an agent is judged, and of last executions, for an option
 
 
 class PlayedEpisode(NamedTuple):
-    """A finished episode: a row of :class:`hypogoal.options.tables.Episodes`."""
+    """A finished episode, which is a row of :class:`hypogoal.options.tables.Episodes`."""
 
-    step: int  # environment steps when it ended, summed over the environments
-    length: int  # its steps
-    reward: float  # undiscounted
-    terminated: int  # 1: it ended in a terminal state; 0: it was cut
-    succeeded: int
+    step: int  # environment steps, summed over the environments, when the episode ended
+    length: int  # steps of the episode
+    reward: float  # the sum of its rewards, not discounted
+    terminated: int  # 1 if the episode ended in a terminal state, 0 if it was cut
+    succeeded: int  # 1 or 0
 
 
 class EpisodeRecorder(Resumable):
-    """Every finished episode of E environments, ``rows``, in the order in which they ended.
+    """A recorder of the finished episodes of E environments.
 
-    ``steps`` are environment steps so far, summed over the environments.
+    Attributes:
+        steps: the number of environment steps so far, summed over the environments.
+        rows: the finished episodes, in the order in which they ended.
     """
 
     CHANGING = ("steps", "lengths", "rewards", "rows")
 
     def __init__(self, environments: int):
         self.steps = 0
-        self.lengths = np.zeros(environments, int)  # so far, of the episodes that run
+        self.lengths = np.zeros(environments, int)  # the steps so far of the episodes that run
         self.rewards = np.zeros(environments)
         self.rows: list[PlayedEpisode] = []
 
     def see(self, step: Step) -> None:
-        """One step of every environment."""
+        """Record one step of every environment."""
         self.steps += len(step.rewards)
         self.lengths += 1
         self.rewards += step.rewards
@@ -63,11 +65,14 @@ class EpisodeRecorder(Resumable):
         self.rewards[over] = 0.0
 
     def counts(self) -> dict[str, int]:
-        """Environment steps and episodes so far."""
+        """Return the numbers of environment steps and of episodes so far."""
         return {"steps": self.steps, "episodes": len(self.rows)}
 
     def recent(self) -> dict[str, float]:
-        """Of the last episodes the share that succeeded, see ``Step``, and the mean steps; NaN before the first."""
+        """Return the share of successes (see ``Step``) and the mean length of the last ``LAST`` episodes.
+
+        The two numbers are NaN before the first episode has ended.
+        """
         last = self.rows[-LAST:]
         if not last:
             return {"success": math.nan, "length": math.nan}
@@ -77,7 +82,10 @@ class EpisodeRecorder(Resumable):
         }
 
     def solved(self, share: float) -> bool:
-        """Whether at least ``share`` of the last ``LAST`` episodes succeeded; never where there are fewer, or at 0."""
+        """Return whether at least ``share`` of the last ``LAST`` episodes succeeded.
+
+        Return false if ``share`` is 0, or if fewer than ``LAST`` episodes have ended.
+        """
         return share > 0 and len(self.rows) >= LAST and self.recent()["success"] >= share
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:

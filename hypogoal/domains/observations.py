@@ -1,6 +1,7 @@
-"""How an observation is read, by its shape and type (the table in docs/own-domain.md), and how pictures are resized.
+"""The rules by which observations are read, and how pictures are resized.
 
-Environments and imported arrays share these rules. An ambiguous observation is refused.
+Environments and imported arrays share the rules, which go by shape and type (see the table in docs/own-domain.md). An
+ambiguous observation is refused.
 """
 
 from itertools import pairwise
@@ -13,7 +14,7 @@ from PIL import Image
 from hypogoal.core.arrays import Bytes
 from hypogoal.observations import NUMBERS, PICTURE, DType, Shape
 
-MOST_CHANNELS = 16  # an axis as short as this may hold channels or frames; the sides of a picture are longer
+MOST_CHANNELS = 16  # the longest axis that may hold channels or frames; the sides of a picture are longer
 CLEARLY = "Give pictures as uint8 (H, W, C), stacked frames among the channels, and numbers as one row of float32."
 
 
@@ -22,10 +23,10 @@ class Reading(NamedTuple):
 
     Attributes:
         dtype: PICTURE or NUMBERS.
-        shape: what it becomes, (H, W, C) of a picture.
-        fault: why it is refused; empty if it is not.
-        axes: of a picture, its height and width, then those that become channels: frames, and colours last. Empty if
-            that is unclear.
+        shape: the shape that the observation becomes, which is (H, W, C) for a picture.
+        fault: why the observation is refused. Empty: it is not refused.
+        axes: a picture's axes of height and width, then the axes that become channels, with colours last. Empty if the
+            axes are unclear.
     """
 
     dtype: DType
@@ -34,13 +35,13 @@ class Reading(NamedTuple):
     axes: Shape = ()
 
     def arranged(self, values: Bytes) -> Bytes:
-        """An observation as a picture (H, W, C); needs ``axes``."""
+        """Return an observation as a picture (H, W, C). The reading must have ``axes``."""
         moved = values.transpose(self.axes)
         return moved.reshape(self.shape)
 
 
 def reading_of(shape: Shape, dtype: DType) -> Reading:
-    """The reading of an observation of this shape and type."""
+    """Return how an observation of this shape and type is read."""
     if len(shape) < 2:
         return Reading(NUMBERS, shape or (1,))
     if dtype == PICTURE:
@@ -51,7 +52,7 @@ def reading_of(shape: Shape, dtype: DType) -> Reading:
 
 
 def _byte_fault(shape: Shape) -> str:
-    """Why uint8 of this shape is refused; empty if it is a picture."""
+    """Return why uint8 of this shape is refused, or an empty text if it is a picture."""
     if len(shape) > 3:
         return "are stacks of pictures"
     if channels_first(shape):
@@ -62,9 +63,10 @@ def _byte_fault(shape: Shape) -> str:
 
 
 def channels_first(shape: Shape) -> bool:
-    """Whether a shape is (C, H, W) rather than (H, W, C): its first axis is short, the other two are long.
+    """Return whether a shape is (C, H, W) rather than (H, W, C).
 
-    Small grids with many planes, such as (7, 7, 20), are (H, W, C).
+    A shape is (C, H, W) if the first axis is short, and the other two are long. Small grids with many planes, such as
+    (7, 7, 20), are (H, W, C).
     """
     if len(shape) != 3 or min(shape[1:]) <= MOST_CHANNELS:
         return False
@@ -73,10 +75,13 @@ def channels_first(shape: Shape) -> bool:
 
 
 def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
-    """The axes that make bytes of two axes or more a picture, and its shape; no axes if it would be refused again."""
+    """Return the axes by which bytes of two axes or more become a picture, and the picture's shape.
+
+    The axes are empty if the picture would be refused again.
+    """
     if len(shape) == 3 and not channels_first(shape):
         return (0, 1, 2), shape
-    # The longest two neighbours are height and width; among equals the second pair.
+    # Height and width are the two neighbouring axes whose shorter axis is longest. Among equal pairs it is the second.
     shorter = [min(pair) for pair in pairwise(shape)]
     height = max(
         range(len(shorter)),
@@ -84,7 +89,7 @@ def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
     )
     sides = (height, height + 1)
     others = [axis for axis in range(len(shape)) if axis not in sides]
-    others.sort(key=lambda axis: shape[axis] in (1, 3))  # colours last
+    others.sort(key=lambda axis: shape[axis] in (1, 3))  # colours are the last axis
     channels = prod(shape[axis] for axis in others)
     target = (*shape[height : height + 2], channels)
     if channels_first(target):
@@ -93,7 +98,10 @@ def _arrangement(shape: Shape) -> tuple[Shape, Shape]:
 
 
 def shrunk_picture(picture: Bytes, longest: int) -> Bytes:
-    """A picture uint8 (H, W, C) scaled down so that its longer side has at most ``longest`` pixels; 0: as it is."""
+    """Return a picture, uint8 (H, W, C), scaled down until its longer side has at most ``longest`` pixels.
+
+    If ``longest`` is 0, the picture keeps its size.
+    """
     height, width = picture.shape[:2]
     longer = max(height, width)
     scale = min(1.0, (longest or longer) / longer)
@@ -103,7 +111,10 @@ def shrunk_picture(picture: Bytes, longest: int) -> Bytes:
 
 
 def resized_picture(picture: Bytes, height: int, width: int) -> Bytes:
-    """A picture uint8 (H, W, C) resized to ``height`` x ``width`` pixels, each the mean of the area that it covers."""
+    """Return a picture, uint8 (H, W, C), resized to ``height`` x ``width`` pixels.
+
+    Each new pixel is the mean of the area that it covers.
+    """
     if picture.shape[:2] == (height, width):
         return picture
     channels = []

@@ -8,10 +8,13 @@ from minigrid.core.grid import Grid
 
 from hypogoal.core.arrays import Bytes
 
-TILE = 8  # pixels a cell
+TILE = 8  # pixels on the side of a cell
 
 
 def draw_tiles(cells: Iterable[tuple[Any, int | None]]) -> Bytes:
-    """Cells, what is in each and the direction of an agent there, None without one, as uint8 (n, 8, 8, 3)."""
+    """Draw the pictures of n cells, uint8 (n, 8, 8, 3).
+
+    A cell is what is in it, and the direction of the agent in it, or None if there is no agent.
+    """
     pictures = [Grid.render_tile(content, direction, tile_size=TILE) for content, direction in cells]
     return np.stack(pictures).astype(np.uint8)  # MiniGrid draws in floats

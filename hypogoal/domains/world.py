@@ -11,7 +11,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Domain, Engine
 
-RANDOM_EPISODES = 200  # of random play, which say how hard a layout is
+RANDOM_EPISODES = 200  # episodes of random play, which measure how hard a layout is
 
 
 class WorldConfig(Config):
@@ -40,7 +40,10 @@ class WorldConfig(Config):
 
 
 def played_world(domain: Domain, collected: Values, config: WorldConfig) -> dict[str, Any]:
-    """The domain's settings with which states were collected, after the changes that the setting ``world`` names."""
+    """Return the settings with which states were collected, after the changes that the setting ``world`` names.
+
+    Raises ``UserError`` if a change is not of a setting of the domain's world.
+    """
     changes = assigned(config.world)
     for name in changes:
         if name not in domain.engine_settings:
@@ -56,10 +59,10 @@ def make_engine(
     environments: int,
     **begins: Any,
 ) -> Engine:
-    """So many environments of a :func:`played_world`; ``begins`` are arguments that say where episodes begin.
+    """Return an engine of ``environments`` environments of a :func:`played_world`.
 
-    A start that the domain does not name, a cap where nobody knows the shortest path, and observations of several keys
-    are a ``UserError``.
+    ``begins`` are arguments that say where episodes begin. Raises ``UserError`` if the domain does not name the start,
+    if there is a cap but the shortest path is not known, or if observations are mixed.
     """
     if config.start:
         check_start(domain, config.start)
@@ -86,14 +89,17 @@ def make_engine(
 
 
 def check_start(domain: Domain, start: str) -> None:
-    """Refuse (``UserError``) a start that the domain does not name."""
+    """Raise ``UserError`` if the domain does not name ``start``."""
     if start not in domain.starts:
         fault = "unknown start" if start else "where are episodes to begin?"
         raise UserError(fault, start or "start", f"Give --set start=X, X one of {', '.join(domain.starts)}.")
 
 
 def columns_of(domain: Domain, sub_goals: Sequence[str], do: str = "Leave termination=oracle out.") -> list[int]:
-    """The columns of these sub-goals among the domain's; a ``UserError`` that says ``do`` where it lacks one."""
+    """Return the columns of ``sub_goals`` among the domain's sub-goals.
+
+    Raises ``UserError``, which advises ``do``, if the domain lacks a sub-goal.
+    """
     for sub_goal in sub_goals:
         if sub_goal not in domain.sub_goals:
             fault, names = f"{domain.name} does not know where this sub-goal holds", ", ".join(domain.sub_goals)
@@ -108,9 +114,10 @@ def write_layout(
     seed: int,
     layouts: str = "",
 ) -> None:
-    """``layout.json``, how hard the layout is: its shortest path, how often random play reaches the goal.
+    """Write ``layout.json``, which says how hard the layout is.
 
-    Both are null where the engine does not know them. ``layouts`` are those of many.
+    The file has the layout's shortest path, and how often random play solves the task. A number is null if the engine
+    does not know it. ``layouts`` is the setting that names several layouts.
     """
     success = engine.random_success(RANDOM_EPISODES, rng_for(seed, "random-play"))
     places = {"start": config.start, "layouts": layouts}

@@ -1,1 +1,1 @@
-"""Numbers and pictures: pure functions on arrays; figures are apart from numbers, files are the stages'."""
+"""Numbers and figures of a run. Numbers are apart from figures; the stages write the files."""

@@ -1,8 +1,8 @@
-"""What choosing is worth: how good options are, whether the better one is taken, and what random choice does.
+"""What choosing is worth: how good options are, whether the better option is taken, and what random choice does.
 
-An option is good where its execution brings about the true sub-goal; how well its classifier matches the truth on all
+An option is good if its execution brings about the true sub-goal. How well its classifier matches the truth on all
 states says little of that. Choice is judged among the members of the sub-goal that was chosen, since which sub-goal is
-due is another matter. The control has the agent's own final options and picks one of those offered at random.
+due is another matter. The control has the agent's own final options, and picks one of those offered at random.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ if TYPE_CHECKING:
     from hypogoal.evaluation.frozen import Choices
     from hypogoal.options.loop import OptionLoop
 
-LEAST = 20.0  # expected choices of a member, below which its preference is not told
-DIFFERENCE = 0.2  # between members' qualities, below which there is nothing to choose
+LEAST = 20.0  # expected choices of a member; with fewer, its preference is not told
+DIFFERENCE = 0.2  # between members' qualities; with less, there is nothing to choose
 MEMORYLESS = ("light", "planned")  # option policies that can be asked in any state
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
-FROZEN = "frozen"  # the scope of what is played after training
+FROZEN = "frozen"  # the scope of episodes that are played after training
 TITLE = "What choosing is worth"
 BY = ["method", "chooser"]
 
 
 def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
-    """How often each option's greedy execution brings about its true sub-goal, the episode not lost: float64 (O,).
+    """Return how often each option's greedy execution brings about its true sub-goal without losing: float64 (O,).
 
-    Of policies that remember nothing, in an engine that knows what follows. ``goals`` (O,) are columns of the engine's
-    labels. Executions begin in ``states`` (D,), each as often as it is there: where its member is negative, its
-    sub-goal does not hold, and can be had within the timeout; NaN for an option that begins nowhere.
+    The policies must remember nothing, and the engine must know what follows. ``goals`` (O,) are columns of the
+    engine's labels. An execution begins in each of ``states`` (D,) in which the option's member is negative, and the
+    sub-goal does not hold but can be had within the timeout. An option that begins nowhere has NaN.
     """
     from hypogoal.options.planned import distances, places_of
 
@@ -78,13 +78,14 @@ def qualities(loop: OptionLoop, goals: Ints, states: Ints) -> Doubles:
 
 
 def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
-    """Whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
+    """Return whether the better of K members are taken, where at least two of the chosen sub-goal's were offered.
 
-    ``quality`` (G*K,) is of :func:`qualities`; NaN where it is not known. Returns ``preference`` (G*K,): chosen /
-    expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected; ``within_rho``: Spearman's rho of
-    the two, mean over sub-goals whose members' qualities differ by ``DIFFERENCE``; ``pair``: of two members offered
-    whose qualities differ by that, how often the better of those taken (.5 at random); ``score``: (quality taken - mean
-    quality) / (best - mean), over decisions (0 at random).
+    ``quality`` (G*K,) is the result of :func:`qualities`, NaN if it is not known. Returns ``preference`` (G*K,), which
+    is chosen / expected among the members of the chosen sub-goal, NaN below ``LEAST`` expected; ``within_rho``,
+    Spearman's rho of quality and preference, mean over sub-goals whose members' qualities differ by ``DIFFERENCE``;
+    ``pair``, how often the better of two members is taken if both were offered, one of them was taken, and their
+    qualities differ by ``DIFFERENCE`` (.5 at random); and ``score``, (quality taken - mean quality) / (best - mean),
+    over decisions (0 at random).
     """
     goals = np.arange(len(quality)) // members
     of_goal = choices.offered & (goals == goals[choices.options][:, None])
@@ -92,7 +93,7 @@ def judge(choices: Choices, quality: Doubles, members: int) -> dict[str, Any]:
     several = counts > 1
     taken, among = choices.options[several], of_goal[several]
     shares = among / counts[several][:, None]
-    expected = shares.sum(axis=0).round(statistics.DIGITS)  # in any order of decisions
+    expected = shares.sum(axis=0).round(statistics.DIGITS)  # equal for any order of decisions
     chosen = np.bincount(taken, minlength=len(quality))
     preference = chosen / np.where(statistics.at_least(expected, LEAST), expected, np.nan)
     return {
@@ -135,9 +136,9 @@ def _score(quality, taken, among):
 
 
 def rows(work):
-    """Every run of an agent that learned to choose among members' options, in a domain that knows what follows.
+    """Yield the numbers of every agent that learned to choose among members' options, if its domain knows what follows.
 
-    The agent's numbers, those of uniform-random choice, and every member's.
+    The numbers are the agent's, those of uniform-random choice, and every member's.
     """
     for artefact in work.contents.agents:
         played = play_agent(artefact)
@@ -151,34 +152,35 @@ def rows(work):
 
 
 def is_playable(artefact: Artefact) -> bool:
-    """Whether it chose to learn among options that can be asked in any state, of one layout of a known domain."""
+    """Return whether an agent learned to choose, on one layout of a known domain, among options without memory."""
     config = artefact.config
-    if choice_of(artefact) != "learned" or ":" in config["termination"]:  # a rule of one's own may ask for more
+    if choice_of(artefact) != "learned" or ":" in config["termination"]:  # a user's own rule may need more than a state
         return False
-    # Of many layouts the states are too many to say what follows in each.
+    # Many layouts have too many states to say what follows in each.
     if config["network"] not in MEMORYLESS or config.get("layouts"):
         return False
     return {*config["sub_goals"]} <= {*load_domain(config["domain"]).sub_goals}
 
 
 def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], dict[str, Doubles]] | None:
-    """A trained agent played on, frozen, and uniform-random choice among its own options.
+    """Play a trained agent, frozen, and uniform-random choice among its own options.
 
-    Returns ``OF_PLAY`` and ``OF_CHOICE`` of both, and of each option (G*K,) its quality and conditional_preference.
-    None where it is not playable, or the engine does not know what each action leads to.
+    Returns ``OF_PLAY`` and ``OF_CHOICE`` of the agent, the same of random choice, and each option's quality and
+    conditional_preference (G*K,). Returns None if the agent is not playable, or if the engine does not know what each
+    action leads to.
     """
     from hypogoal.evaluation.frozen import ENVIRONMENTS, play_both  # with PyTorch, which a report does not need
     from hypogoal.meta.episodes import agent_of
 
     config, seed = artefact.config, artefact.seed
-    # one game first, since many take long to begin
+    # an engine with one game is asked first, since many games take long to begin
     if not is_playable(artefact) or engine_on(config, [config["layout_seed"]]).plan() is None:
         return None
     loop = agent_of(artefact, seed, ENVIRONMENTS)
     of_options = table.options_of(config).get_level_values("sub_goal")
     goals = of_options.map(load_domain(config["domain"]).sub_goals.index).to_numpy()
     of_both = play_both(loop, seed)
-    quality = qualities(loop, goals, of_both[0].choices.states)  # where the agent itself decides
+    quality = qualities(loop, goals, of_both[0].choices.states)  # executions begin where the agent itself decided
     numbers, preferences = [], []
     for played in of_both:
         scores = played.scores(loop.engine.shortest_path())
@@ -189,13 +191,16 @@ def play_agent(artefact: Artefact) -> tuple[dict[str, float], dict[str, float], 
 
 
 def context(results):
-    """Each agent (``chooser`` its own), and uniform-random choice among its own options."""
+    """Return the tables of each agent (``chooser`` its own), and of uniform-random choice among its own options."""
     runs = table.per_run(results.of(sub_goal=""), *OF_PLAY, *OF_CHOICE, scope=FROZEN)
     return statistics.tables_of(with_choosers(runs), BY)
 
 
 def with_choosers(runs: pd.DataFrame) -> pd.DataFrame:
-    """The same with a column ``chooser``; the method of uniform-random choice is the agent whose options it has."""
+    """Return the numbers of runs with a column ``chooser``.
+
+    The method of uniform-random choice becomes the agent whose options are chosen from.
+    """
     uniform = runs["method"] == UNIFORM
     agents = runs[~uniform].drop_duplicates("artefact").set_index("artefact")["method"]
     return runs.assign(chooser=runs["method"].where(uniform, "the agent's"), method=runs["artefact"].map(agents))

@@ -19,14 +19,14 @@ from hypogoal.evaluation.table import melted, per_run, tidy
 from hypogoal.options.tables import Episodes
 
 TITLE = "Summary"
-FIRST = 20  # episodes that a curve begins with: of many parallel ones, the first to end are the lucky ones
-SOLVED = 0.95  # share of the window's episodes
-WITHIN = {"near": 1.5, "within_2": 2.0}  # times the shortest path
-POINTS = 151  # of a curve
-SHORT = 20  # episodes that curves over episodes are means of, and of which 95 % must be solved
-WINDOWS = ((1, 10), (11, 20), (21, 50), (51, 100))  # the first and the last of the episodes that are counted
+FIRST = 20  # episodes before a curve begins, because the first of parallel episodes to end are lucky
+SOLVED = 0.95  # share of a window's episodes that counts as solved
+WITHIN = {"near": 1.5, "within_2": 2.0}  # multiples of the shortest path
+POINTS = 151  # points of a curve
+SHORT = 20  # episodes that a point of a curve over episodes averages, and of which 95 % must be solved
+WINDOWS = ((1, 10), (11, 20), (21, 50), (51, 100))  # the first and the last episode of each window
 BY_EPISODE = "solved_by_episode"
-MOST = 10_000  # episodes, of its curve
+MOST = 10_000  # episodes of a curve over episodes
 BY = ["method"]
 QUANTITIES = (
     "success",
@@ -43,7 +43,7 @@ QUANTITIES = (
     "episodes_to_95",
 )
 PAIRED = ("success", "length", "near")
-FIGURES = {  # file, label, and what is dotted across
+FIGURES = {  # by quantity: file, label, and the quantity that is dotted across
     "reward": ("figure6", "Undiscounted reward per episode", "random_success"),
     BY_EPISODE: ("figure6-episodes", "Share of episodes solved", "random_success"),
     "solved_length": ("figure6-length", "Length of solved episodes", "shortest_path"),
@@ -55,9 +55,10 @@ def scores(
     steps: Ints,
     shortest: float | Doubles | None,
 ) -> dict[str, Doubles]:
-    """``success``, and success within so many times the shortest path, ``WITHIN``: 1 or 0 of each episode (E, ...).
+    """Return ``success``, and success within the multiples ``WITHIN`` of the shortest path, 1 or 0 (E, ...) each.
 
-    ``shortest``, steps, is broadcast to the episodes; NaN or None where no path is known, and so are those scores.
+    ``shortest``, in steps, is broadcast to the episodes. If it is NaN or None, no path is known, and the scores within
+    multiples are NaN.
     """
     path = np.asarray(shortest, float)
     columns: dict[str, Any] = {"success": succeeded * 1.0}
@@ -68,7 +69,7 @@ def scores(
 
 
 def table_of(episodes: Episodes) -> pd.DataFrame:
-    """What is averaged of each episode, a column each; ``solved_length`` is NaN where it failed."""
+    """Return what is averaged of each episode, a column each. ``solved_length`` is NaN if the episode failed."""
     failed = ~episodes.succeeded
     columns = {
         "success": episodes.succeeded,
@@ -82,9 +83,10 @@ def table_of(episodes: Episodes) -> pd.DataFrame:
 
 
 def curves(episodes: Episodes, grid: Ints) -> pd.DataFrame:
-    """Figure 6: means of the last ``LAST`` episodes known by each step of ``grid`` (G,), its index.
+    """Return Figure 6's curves: by each step of ``grid`` (G,), the means of the last ``LAST`` episodes that had ended.
 
-    From ``FIRST`` on. Columns reward, success, length and solved_length; that is NaN where none is solved.
+    The index is the steps by which ``FIRST`` episodes had ended. Columns: reward, success, length and solved_length,
+    which is NaN if no episode is solved.
     """
     values = table_of(episodes).drop(columns=["ended", "cut"])
     means = values.rolling(LAST, min_periods=1).mean()
@@ -94,7 +96,10 @@ def curves(episodes: Episodes, grid: Ints) -> pd.DataFrame:
 
 
 def by_episode(succeeded: Bools) -> pd.DataFrame:
-    """The share solved of the last ``SHORT`` of (n,) episodes, from the tenth on; its index is their number."""
+    """Return the share solved of the last ``SHORT`` of (n,) episodes, from the tenth on.
+
+    The index is the number of the episode.
+    """
     solved = pd.Series(succeeded, np.arange(1, len(succeeded) + 1), dtype=float).rename_axis("step")
     shares = solved.rolling(SHORT, min_periods=1).mean()
     grid = np.geomspace(10, MOST, POINTS).round().astype(np.int64)
@@ -103,9 +108,10 @@ def by_episode(succeeded: Bools) -> pd.DataFrame:
 
 
 def episode_numbers(succeeded: Bools) -> dict[str, float]:
-    """How soon (n,) episodes succeed, counted as they ended: the share of each of ``WINDOWS``, once all of it is there.
+    """Return how soon (n,) episodes succeed, in the order in which they ended.
 
-    ``episodes_to_95``: how many until 95 % of the last ``SHORT`` had succeeded; NaN: never.
+    Each of ``WINDOWS`` has the share solved, NaN if the window is not complete. ``episodes_to_95`` is the number of
+    episodes until 95 % of the last ``SHORT`` had succeeded, or NaN if they never had.
     """
     solved = pd.Series(succeeded, np.arange(1, len(succeeded) + 1), dtype=float)
     numbers = {}
@@ -117,10 +123,10 @@ def episode_numbers(succeeded: Bools) -> dict[str, float]:
 
 
 def run_numbers(episodes: Episodes, shortest_path: int | None) -> dict[Any, float]:
-    """The numbers of one run, over its last ``LAST`` training episodes at most; NaN without episodes.
+    """Return the numbers of one run, over its last ``LAST`` training episodes at most. Without episodes, they are NaN.
 
-    ``shortest_path``: primitive steps from the start to the goal at least; None or 0 where unknown. ``steps_to_95``:
-    the first step at which 95 % of the last ``LAST`` had succeeded; NaN: never, or too few.
+    ``shortest_path``: the least number of primitive steps from the start to the goal, None or 0 if unknown.
+    ``steps_to_95``: the first step at which 95 % of the last ``LAST`` episodes had succeeded, NaN if there is none.
     """
     last = episodes.last()
     shortest = shortest_path or np.nan
@@ -139,13 +145,16 @@ def run_numbers(episodes: Episodes, shortest_path: int | None) -> dict[Any, floa
 
 
 def budget_of(config: Mapping[str, Any]) -> int:
-    """An agent's environment steps, those of the options that it continues included: some end before their limit."""
+    """Return the environment steps that an agent took, with those of the options that it continues.
+
+    Training may end before its limit.
+    """
     practice = config.get("options_ended_at", config.get("options_steps", 0))
     return int(config.get("ended_at", config.get("steps", 0)) + practice)
 
 
 def rows(work):
-    """Every agent's run at its end, and its curves; random play on each layout."""
+    """Yield the numbers of every agent's run at its end, its curves, and random play on each layout."""
     agents = work.ranked(work.contents.agents)
     most = max((budget_of(artefact.config) for artefact in agents), default=0)
     grid = np.linspace(0, most, POINTS).round().astype(int)
@@ -164,7 +173,7 @@ def rows(work):
 
 
 def facts(work):
-    """Of each agent, by its name, its ``members``, and ``choice``: learned, random, or none of members."""
+    """Return each agent's ``members`` and its ``choice`` among them (learned, random or empty), by its name."""
     agents = {}
     for artefact in work.contents.agents:
         name, members = work.place(artefact)["method"], artefact.config.get("members")
@@ -173,20 +182,20 @@ def facts(work):
 
 
 def chosen_by(results: Results, choice: str) -> dict[str, dict[str, Any]]:
-    """The agents whose choice among members' options is learned or random."""
+    """Return the agents whose choice among members' options is ``choice``, learned or random."""
     agents = results.facts["agents"]
     return {name: agent for name, agent in agents.items() if agent["choice"] == choice}
 
 
 def context(results):
-    """Every agent's numbers; Figure 6."""
+    """Return every agent's numbers, and Figure 6."""
     agents = results.of(method=[*results.facts["agents"]])
     tables = tables_of(per_run(agents, *QUANTITIES), BY, PAIRED)
     return tables and tables | {"figures": [*_figures(results)]}
 
 
 def _figures(results):
-    """Figure 6 and the same of the length of solved episodes, where it is not the same everywhere."""
+    """Yield Figure 6, and the other ``FIGURES`` whose values are not all equal."""
     for quantity, (name, label, reference) in FIGURES.items():
         drawn = results.of(quantity=quantity).dropna(subset="step")
         if drawn.empty or (quantity != "reward" and drawn["value"].nunique() < 2):
@@ -203,10 +212,10 @@ def learning_curves(
     label: str,
     reference: float = np.nan,
 ) -> Figure:
-    """Figure 6: a quantity of episodes against environment steps, a line per method, a ``reference`` dotted across.
+    """Draw Figure 6: a quantity of episodes against environment steps, a line per method, and a dotted ``reference``.
 
-    ``drawn`` are rows of the table of numbers; those of ``BY_EPISODE`` are drawn against episodes. The mean over
-    layouts, or runs of one layout, and a band of one standard error.
+    ``drawn`` are rows of the table of numbers; those of ``BY_EPISODE`` are drawn against episodes. A line is the mean
+    over layouts, or over runs of one layout, with a band of one standard error.
     """
     unit = "layout" if drawn["layout"].nunique() > 1 else "artefact"
     figure, axes = plot(2.9)

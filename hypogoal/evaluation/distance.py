@@ -1,4 +1,4 @@
-"""Figures 4 and 5: how near to the true sub-goal options stop that were learned on ladders."""
+"""Figures 4 and 5: how near to the true sub-goal the options stop that were learned on ladders."""
 
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -24,9 +24,9 @@ from hypogoal.hypotheses.scores import most_and_least
 from hypogoal.options.tables import Executions
 
 TITLE = "Options on ladders"
-INSIDE = 300  # the distance of an execution that begins inside its own termination set (the paper's, a ladder's length)
-NEAR = 4  # Manhattan distance that counts as there: the farthest corner of the base region, 2 in x and 2 in y
-BEST, WORST = "best_member", "worst_member"  # quantities: which member it is
+INSIDE = 300  # distance of an execution that begins inside its own termination set: the paper's, a ladder's length
+NEAR = 4  # Manhattan distance that counts as at the base, whose farthest corner is 2 away in x and 2 in y
+BEST, WORST = "best_member", "worst_member"  # quantities whose value is the number of a member
 SHARES = ("reached_base", "inside_at_start", "timed_out", "died")
 PICKED = {"best": BEST, "validated": VALIDATED, "mean": "mean", "worst": WORST}
 BY = ["N", "method", "sub_goal"]
@@ -41,11 +41,11 @@ STOP = ["room", "column", "row", "fate"]  # where an execution stopped, in the p
 
 
 def last_executions(executions: Executions) -> DataFrame:
-    """The last executions of each option, a row each, with what they count.
+    """Return the last executions of each option, a row each, with what counts.
 
-    ``counted``, the distance, is 300 where it began inside its own termination set; ``reached_base``: it stopped within
-    4 of a true base and did not begin inside; ``timed_out``: neither classifier nor death ended it; ``fate`` as in
-    Figure 5.
+    ``counted`` is the distance, or 300 if the execution began inside its own termination set. ``reached_base``: it
+    stopped within 4 of a true base, and did not begin inside. ``timed_out``: neither the classifier nor death ended it.
+    ``fate`` is as in Figure 5.
     """
     last = DataFrame(vars(executions)).groupby("option").tail(LAST)
     inside = last["inside_at_start"]
@@ -60,9 +60,10 @@ def last_executions(executions: Executions) -> DataFrame:
 
 
 def option_numbers(executions: Executions) -> DataFrame:
-    """A row for each option with the numbers of its last executions; no deviation of one execution.
+    """Return a row for each option with the numbers of its last executions.
 
-    Units: the domain's; duration in steps; shares of executions.
+    The distance is in the domain's units, the duration in steps, and the others are shares of executions. The deviation
+    of one execution is NaN.
     """
     of_option = last_executions(executions).groupby("option")
     numbers = of_option[["duration", *SHARES]].mean()
@@ -74,7 +75,10 @@ def option_numbers(executions: Executions) -> DataFrame:
 
 
 def rows(work):
-    """Every member's option on every ladder; where the first seed's stop, for Figure 5, goes to the arrays."""
+    """Yield the numbers of every member's option on every ladder.
+
+    Where the options of the first seed stopped, which Figure 5 shows, is written to the arrays.
+    """
     ladders = work.ranked(work.contents.ladders)
     first = min((artefact.seed for artefact in ladders), default=0)
     for artefact in ladders:
@@ -98,10 +102,10 @@ def rows_of_ladder(
     validated: Mapping[str, float | None],
     place: Mapping[str, Any],
 ) -> Iterator[DataFrame]:
-    """One options artefact, trained from one start (a ladder) on G sub-goals with K members each.
+    """Yield the rows of one options artefact, trained from one start (a ladder) on G sub-goals with K members each.
 
-    Per sub-goal each member's numbers; the best member (the least mean distance), the worst, and the validated one.
-    Where ``mask_reached``, options that would begin inside were not offered: they count 300.
+    The rows of a sub-goal are each member's numbers, and which member is best (the least mean distance), worst, and
+    validated. With ``mask_reached``, options that would begin inside were not offered, and count 300.
     """
     options = options_of(config)
     every = option_numbers(executions).reindex(range(len(options))).set_axis(options)
@@ -120,7 +124,7 @@ def _write_stops(
     artefact,
     executions,
 ):
-    """Figure 5: ``STOP`` of each execution of each sub-goal's best option, and pictures of the rooms."""
+    """Write what Figure 5 needs: ``STOP`` of each execution of each sub-goal's best option, and pictures of rooms."""
     domain = installed_domain(artefact.config["domain"])
     if domain is None or not domain.pictures:
         return
@@ -136,10 +140,10 @@ def _write_stops(
 
 
 def context(results):
-    """Figure 4: each seed's mean over the run's ladders of the best, validated, mean and worst member.
+    """Return Figure 4's table: each seed's mean over the run's ladders of the best, validated, mean and worst member.
 
-    And the best member's shares. A seed that lacks a ladder is left out: unlike ladders are not averaged. Compared is
-    ladder by ladder, but oracle terminations, which have no members to choose among.
+    The table has the best member's shares, too. A seed that lacks a ladder is left out, because unlike ladders are not
+    averaged. Methods are compared ladder by ladder, except oracle terminations, which have no members to choose among.
     """
     numbers = results.numbers[results.numbers["ladder"] != ""]
     if numbers.empty:
@@ -167,7 +171,7 @@ def context(results):
 
 
 def _figures(results, table):
-    """Figures 4 and 5."""
+    """Yield Figures 4 and 5."""
     best = table[table["quantity"] == "best"]
     yield Drawn("figure4", "Figure 4: distance to the true sub-goal", partial(distance_bars, best))
     rooms = results.within("pictures")
@@ -190,7 +194,7 @@ def _figures(results, table):
 
 
 def distance_bars(best: DataFrame) -> Figure:
-    """Figure 4: the best member's distance, methods side by side for each N; lower is better."""
+    """Draw Figure 4: the best member's distance, methods side by side for each N. Lower is better."""
     groups = best["N"].map("N={}".format).mask(best["N"].isna(), "true sub-goal")
     if best["sub_goal"].nunique() > 1:
         groups = best["sub_goal"] + "\n" + groups
@@ -202,9 +206,9 @@ def distance_bars(best: DataFrame) -> Figure:
 
 
 def stops_over_rooms(rooms: Mapping[str, Bytes], options: Mapping[str, DataFrame]) -> Figure:
-    """Figure 5: a row per option, side by side the two rooms in which most executions of all of them stopped.
+    """Draw Figure 5: a row per option, and side by side the two rooms in which most executions stopped.
 
-    What became of an execution is told by shape and by colour. ``rooms`` are pictures uint8 (H, W, 3) by their numbers,
+    Shape and colour tell what became of an execution. ``rooms`` are pictures, uint8 (H, W, 3), by their numbers;
     ``options`` have ``STOP`` of each execution.
     """
     every = pd.concat(options.values())["room"].astype(int)

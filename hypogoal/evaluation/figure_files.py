@@ -17,10 +17,11 @@ def draw_figures(
     *,
     force: bool = False,
 ) -> tuple[list[Path], list[str]]:
-    """Draw the paper's figures, those that the run has artefacts for, as files of their own, and ``captions.md``.
+    """Draw the paper's figures that the run has artefacts for as files of their own, and write ``captions.md``.
 
-    Returns the files written, and a line for each of Figures 2 to 9 that cannot be drawn, with what it needs. A run
-    that was not evaluated, another ``kind`` than svg, pdf and png, or a file that is there is a ``UserError``.
+    Returns the files written, and a line for each of Figures 2 to 9 that cannot be drawn, with what it needs. Raises
+    ``UserError`` if the run was not evaluated, if ``kind`` is none of svg, pdf and png, or if a file exists and
+    ``force`` is not given.
     """
     if kind not in UNDATED:
         raise UserError("no such format of figures", kind, f"Choose one of {', '.join(UNDATED)}.")

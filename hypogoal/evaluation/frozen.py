@@ -1,7 +1,7 @@
-"""Trained agents play on, and nothing is learned: the first n episodes of every environment.
+"""Play of trained agents that learn nothing from it: the first n episodes of every environment.
 
-Episodes differ in length, and the failed ones are the longest. Of all episodes that end within a number of steps too
-many are short, so every environment plays the same number of episodes, however long they take.
+Episodes differ in length, and failed episodes are the longest. Among the episodes that end within a number of steps,
+too many are short. So every environment plays n episodes, however long they take.
 """
 
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from hypogoal.evaluation.curves import scores
 from hypogoal.options.choosers import Chooser, Offered, RandomChooser
 from hypogoal.options.loop import NONE, OptionLoop
 
-ENVIRONMENTS, EPISODES = 64, 8  # of an agent on its own layout: 512 episodes,
-STEPS = 1_000  # or more, where so many steps of an environment hold more of the longest ones
+ENVIRONMENTS, EPISODES = 64, 8  # of an agent on its own layout, 512 episodes in all,
+STEPS = 1_000  # or more, if so many steps of one environment hold more of the longest episodes
 
 
 @dataclass(frozen=True)
 class Choices(Columns):
-    """D decisions: the states int64 (D,), the options chosen int64 (D,), and those offered, bool (D, O)."""
+    """D decisions: the states, int64 (D,), the options chosen, int64 (D,), and the options offered, bool (D, O)."""
 
     states: Ints
     options: Ints
@@ -29,19 +29,22 @@ class Choices(Columns):
 
 @dataclass(frozen=True)
 class Play:
-    """The first n episodes of each of E environments: their steps int64 (E, n) and success bool (E, n), and choices."""
+    """The first n episodes of each of E environments, and the decisions in them.
+
+    ``length`` int64 (E, n) is in steps, ``succeeded`` is bool (E, n).
+    """
 
     length: Ints
     succeeded: Bools
     choices: Choices
 
     def scores(self, shortest: float | Doubles | None) -> dict[str, Doubles]:
-        """See :func:`scores`; and the ``length``."""
+        """Return the scores of :func:`curves.scores`, and ``length``, each (E, n)."""
         return scores(self.succeeded, self.length, shortest) | {"length": self.length.astype(float)}
 
 
 class Always(Chooser):
-    """Chooses one option, whatever is offered."""
+    """A chooser that chooses one option, whatever is offered."""
 
     def __init__(self, option: int):
         self.option = option
@@ -60,7 +63,7 @@ def play_both(
     seed: int,
     episodes: int = 0,
 ) -> tuple[Play, Play]:
-    """The agent itself, and uniform-random choice among its options, see :func:`play`."""
+    """Play the agent itself, and uniform-random choice among its options. Return both, see :func:`play`."""
     own = play(loop, loop.chooser, episodes)
     return own, play(loop, RandomChooser(rng_for(seed, "uniform-choice")), episodes)
 
@@ -70,9 +73,10 @@ def play(
     chooser: Chooser,
     episodes: int = 0,
 ) -> Play:
-    """So many episodes in each environment, begun anew; options are greedy and choices are drawn as in training.
+    """Play ``episodes`` new episodes in each environment. Options are greedy, and choices are drawn as in training.
 
-    By default as many as the cap alone decides: what comes of them must not.
+    The default number of episodes depends on the engine's cap alone, because a number that depends on the agent would
+    favour some agents.
     """
     engine = loop.engine
     episodes = episodes or max(EPISODES, STEPS // engine.max_steps)

@@ -1,6 +1,7 @@
 """How good hypotheses are on layouts that no data came from, and how much members differ.
 
-Also whatever their thresholds, and without the luck of picking the best; and which planted features they have found.
+Some numbers do not depend on the members' thresholds, or on the luck of picking the best member. Others say which
+planted features the members have found.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,11 +23,11 @@ from hypogoal.hypotheses import scores
 
 TITLE = "Hypotheses"
 HELDOUT = "heldout"
-# Where held-out states say which rooms training saw, the values of their origin ``seen``: its room was in no training
-# set, among the unlabelled states, or among the labelled ones.
+# Values of the origin ``seen``, which held-out states have if it is known which rooms training saw. 0: the room was in
+# no training set; 1: the room is among the unlabelled states; 2: the room is among the labelled states.
 SCOPES = {"unseen": (0,), "all": (0, 1, 2), "labelled": (2,)}
 VALIDATION = "labelled"
-VALIDATED = "validated_member"  # the quantity that is its number
+VALIDATED = "validated_member"  # the quantity whose value is the number of that member
 OWNED_FROM, IGNORED_TO = 0.95, 0.6  # areas under the ROC curve
 BY = ["method", "sub_goal"]
 WHICH = ("best", "mean", "worst")
@@ -36,7 +37,7 @@ KNOWLEDGE = ("ranking", *CROSS_FITTED, "at_best_threshold", "calibration_gap")
 
 
 def look(work, judgement):
-    """What members know and how much they disagree, and which one labelled rooms pick."""
+    """Yield rows on what members know, on how much they disagree, and on which member the labelled rooms pick."""
     place, judged = work.place_of(judgement), judgement.judged
     for rows in rows_of(judged):
         yield rows.assign(**place)
@@ -48,9 +49,10 @@ def look(work, judgement):
 
 
 def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
-    """K members on N held-out states, in each scope: all, or by whether training saw the room.
+    """Yield the rows of K members on N held-out states, in each scope.
 
-    Planted features are scopes, too, in which they are the truth.
+    The scopes are all states, or the states by whether training saw their room. Each planted feature is a scope, too,
+    in which the feature is the truth.
     """
     labels, origins = judged.labels, judged.origins
     numbers = {
@@ -85,11 +87,12 @@ def rows_of(judged: Judged) -> Iterator[pd.DataFrame]:
 
 
 def knowledge(judged: Judged, inside: Bools, contexts: Ints | None) -> tuple[dict[str, Doubles], dict[str, float]]:
-    """What K members know of the states ``inside``, (N,) like ``contexts``, layouts or rooms.
+    """Return what K members know of the states ``inside``, bool (N,).
 
-    Returns of each member (K,) ``at_best_threshold`` (balanced accuracy) and ``calibration_gap`` (how much of that its
-    own threshold loses); and of the best member, picked on half of the contexts and scored on the other,
-    ``CROSS_FITTED``; nothing for fewer than two contexts.
+    ``contexts`` (N,) are layouts or rooms. The first result has, for each member (K,), ``at_best_threshold`` (balanced
+    accuracy) and ``calibration_gap``, which is how much of that balanced accuracy the member's own threshold loses. The
+    second has ``CROSS_FITTED``, the scores of the best member, which is picked on half of the contexts and scored on
+    the other half. The second is empty if there are fewer than two contexts.
     """
 
     def scored(states):
@@ -109,9 +112,10 @@ def knowledge(judged: Judged, inside: Bools, contexts: Ints | None) -> tuple[dic
 
 
 def choose(predictions: Bools, labels: Bools, seen: Ints) -> dict[str, float | None]:
-    """The member with the highest balanced accuracy on rooms of labelled groups; ``validation``: that.
+    """Return the member with the highest balanced accuracy on rooms of labelled groups, and that as ``validation``.
 
-    The first of equally good ones, since their order is random; None where those rooms lack a class.
+    Of equally good members, the first is picked, because their order is random. Both values are None if the rooms lack
+    a class.
     """
     inside = np.isin(seen, SCOPES[VALIDATION])
     accuracies = scores.member_scores(predictions[inside], labels[inside])["balanced_accuracy"]
@@ -120,10 +124,11 @@ def choose(predictions: Bools, labels: Bools, seen: Ints) -> dict[str, float | N
 
 
 def coverage(probabilities: Floats, planted: Mapping[str, Ints]) -> float:
-    """The share of planted features (N,) that some member (N, K) has found: it ranks by it, and by no other.
+    """Return the share of planted features (N,) that some member (N, K) has found.
 
-    Every combination of features is equally frequent, so an area under the ROC curve of .5 is blindness to a feature.
-    NaN where some combination is missing: who ranks by one feature then ranks by another, too.
+    A member has found a feature if it ranks states by this feature, and by no other. Every combination of features is
+    equally frequent, so a member that is blind to a feature has an area under the ROC curve of .5. Returns NaN if some
+    combination is missing, because a member that ranks by one feature then ranks by another, too.
     """
     holding = np.stack([values > 0 for values in planted.values()], axis=1)
     if len(np.unique(holding, axis=0)) < 2 ** len(planted):
@@ -136,7 +141,10 @@ def coverage(probabilities: Floats, planted: Mapping[str, Ints]) -> float:
 
 
 def context(results):
-    """The numbers of ensembles but those judged room by room, which ``rooms`` has; Figure 3's for one context."""
+    """Return the tables of ensembles that are not judged room by room, which :mod:`.rooms` has, and a figure.
+
+    The figure is the counterpart of Figure 3 for data of one context.
+    """
     by_room = results.of(scope="unseen")["artefact"]
     numbers = results.numbers[~results.numbers["artefact"].isin(by_room)]
     values = [per_run(numbers, "balanced_accuracy", scope=HELDOUT, member=which, name=which) for which in WHICH]
@@ -154,7 +162,7 @@ def context(results):
 
 
 def chosen_in(results) -> dict[str, Any]:
-    """For the template: by ensemble and sub-goal, what ``diversity_weight=auto`` chose, and tried."""
+    """Return, by ensemble and sub-goal, the weights that ``diversity_weight=auto`` chose and tried."""
     recorded = results.facts.get("provenance", {"artefacts": []})  # not where several runs are compared
     chosen = {}
     for artefact in recorded["artefacts"]:
@@ -164,7 +172,10 @@ def chosen_in(results) -> dict[str, Any]:
 
 
 def members_figure(means: pd.DataFrame) -> Figure:
-    """Balanced accuracy by method and sub-goal, the index of ``best``, ``mean`` and ``worst``: a range of members."""
+    """Draw balanced accuracy by method and sub-goal, as bars with the range of members.
+
+    ``means`` has the index method and sub-goal, and the columns ``best``, ``mean`` and ``worst``.
+    """
     wide = means.unstack("method", sort=False)
     ranges = np.stack([wide["mean"] - wide["worst"], wide["best"] - wide["mean"]])
     height = 1 + 0.2 * wide["mean"].size

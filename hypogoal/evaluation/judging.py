@@ -1,4 +1,4 @@
-"""What members say of held-out and of unlabelled states: by far the longest part of an evaluation, on several cores."""
+"""What members say of held-out and unlabelled states: by far the longest part of an evaluation, on several cores."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -18,7 +18,7 @@ from hypogoal.evaluation.names import places_of, rank
 from hypogoal.evaluation.run import Contents, takes
 from hypogoal.observations import Observations
 
-SPREAD_FROM = 4e9  # bytes of states times members from which on more processes pay where each starts in 3 s
+SPREAD_FROM = 4e9  # bytes of states times members; from here on, processes that start in 3 s save time
 WHERE = {0: "unseen", 1: "unlabelled data from it", 2: "labelled data from it"}  # values of the origin ``seen``
 
 
@@ -37,13 +37,13 @@ class Judgement(NamedTuple):
     """What the members of one sub-goal say."""
 
     artefact: Artefact  # the ensemble
-    data: Path  # the file that it is judged on
+    data: Path  # the file on whose states the ensemble is judged
     sub_goal: str
     judged: Judged
 
 
 def place_of(origins: Mapping[str, Ints], state: int) -> str:
-    """Where a state is from, in words; nothing where no origin says it."""
+    """Return where a state is from, in words, or an empty text if no origin says it."""
     if "layout_seed" in origins:
         return f"layout {origins['layout_seed'][state]}"
     if "room" not in origins:
@@ -58,7 +58,7 @@ class Work:
 
     contents: Contents  # the run's artefacts
     arrays: Any  # ``arrays.h5``, to be written into
-    progress: Progress  # is told of each sub-goal judged and looked at, each run, and each layout that one plays
+    progress: Progress  # counts sub-goals judged and looked at, runs, and layouts that an agent plays
     layouts: tuple[int, ...] = ()  # on which trained agents are to play
     facts: dict[str, Any] = field(default_factory=dict)  # what is not a number, for ``run.json``
     validated: dict[Path, Any] = field(default_factory=dict)  # the member that labelled rooms pick for each sub-goal
@@ -68,21 +68,22 @@ class Work:
         self.browsed = most_used(self.contents)
 
     def place(self, artefact: Artefact) -> dict[str, Any]:
-        """Where the numbers of an artefact of the run stand in the table: its method, N, ladder, layout, seed, path."""
+        """Return an artefact's fields in the table of numbers: method, N, ladder, layout, seed, artefact."""
         return self.places[artefact.path]
 
     def place_of(self, judgement: Judgement) -> dict[str, Any]:
-        """Where the numbers of a sub-goal's members stand."""
+        """Return the fields in the table of a sub-goal's members."""
         return self.place(judgement.artefact) | {"sub_goal": judgement.sub_goal}
 
     def ranked(self, artefacts: list[Artefact]) -> list[Artefact]:
-        """Some of the run's, the paper's method first."""
+        """Return artefacts of the run, the paper's method first."""
         return sorted(artefacts, key=lambda artefact: rank(self.place(artefact)["method"]))
 
     def judgements(self) -> Iterator[Judgement]:
-        """Every sub-goal of every ensemble judged, the paper's method first, in any number of processes.
+        """Judge every sub-goal of every ensemble, in any number of processes, and yield the judgements.
 
-        Those on the same states are judged one after another, since each process keeps the last ones that it read.
+        The paper's method comes first. Ensembles on the same states are judged one after another, since each process
+        keeps the last states that it read.
         """
         ranked = self.ranked(self.contents.ensembles)
         ensembles = [(artefact, self.contents.data_of[artefact.path]) for artefact in ranked]
@@ -103,7 +104,10 @@ class Work:
 
 
 def most_used(contents: Contents) -> Path | None:
-    """Which of the ensembles with the most members the most artefacts were learned from; the first of several."""
+    """Return the path of the ensemble from which the most artefacts were learned, or None without ensembles.
+
+    Only the ensembles with the most members count. Of several, the first is returned.
+    """
     learned = filter(takes, [*contents.agents, *contents.ladders])
     users = Counter(artefact.input("ensemble").resolve() for artefact in learned)
     ranks = {}
@@ -113,7 +117,10 @@ def most_used(contents: Contents) -> Path | None:
 
 
 def processes_for(ensembles: list[tuple[Artefact, Path]]) -> int:
-    """How many processes are worth it, of ensembles on data: one where their start would take longer than it saves."""
+    """Return how many processes to use for ensembles on data files.
+
+    It is one if the start of others would take longer than they save.
+    """
     work = 0.0
     for artefact, data in ensembles:
         dataset = open_dataset(data)
@@ -125,7 +132,7 @@ def processes_for(ensembles: list[tuple[Artefact, Path]]) -> int:
 
 
 def judge(artefact: Artefact, data: Path) -> dict[str, Judged]:
-    """What each sub-goal's members say, of an ensemble on a data file."""
+    """Return what each sub-goal's members of an ensemble say of the states in a data file, by sub-goal."""
     from hypogoal.hypotheses.ensemble import read_ensemble, together  # with PyTorch, which a report does not need
 
     prepare()
@@ -157,6 +164,9 @@ def judge(artefact: Artefact, data: Path) -> dict[str, Judged]:
 
 @lru_cache(maxsize=1)
 def states_of(data: Path) -> tuple[dict[str, States], Observations]:
-    """Every sub-goal's held-out states, and the unlabelled ones: the largest things here, read once for all."""
+    """Return every sub-goal's held-out states, and the unlabelled states.
+
+    They are the largest things of an evaluation, so they are read once for all ensembles.
+    """
     dataset = open_dataset(data)
     return dataset.all_heldout(), dataset.unlabelled()

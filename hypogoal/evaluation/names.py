@@ -1,6 +1,6 @@
-"""What ensembles and agents are called: made once, when a run is evaluated, as people read it.
+"""What ensembles and agents are called. Names are made once, when a run is evaluated, for people to read.
 
-Runs that were not made alike are never averaged: they have different names.
+Runs that were not made alike are never averaged, because they have different names.
 """
 
 import json
@@ -18,15 +18,15 @@ from hypogoal.evaluation.run import Contents, takes
 NOT_A_VARIANT = frozenset(
     {
         *("layout_seed", "sub_goals", "observation_shape", "setting", "random_episodes", "workers", "hyperparameters"),
-        *("world", "members", "observation_dtype", "groups", "domain_config"),  # which the names or the column N say
-        *("ended_at", "until_reached", "options_ended_at", "options_steps", "chosen"),  # which came out
+        *("world", "members", "observation_dtype", "groups", "domain_config"),  # the names or the column N say them
+        *("ended_at", "until_reached", "options_ended_at", "options_steps", "chosen"),  # results of training
     }
 )
 ON_LADDERS = dict.fromkeys(
     ("start", "domain_config", "termination"),
     "",
-)  # of options, said in other columns
-OF_DIVERSITY = {"diversity_weight", "schedule", "restarts", "share"}  # settings without effect where there is none
+)  # settings of options on ladders that other columns say
+OF_DIVERSITY = {"diversity_weight", "schedule", "restarts", "share"}  # settings without effect if there is no diversity
 OBJECTIVES = {"dbat": "D-BAT", "divdis": "DivDis", "independent": "independence", "none": "no diversity"}
 ONE = "one classifier"
 ORACLE = "oracle termination"
@@ -35,14 +35,14 @@ RANDOM = "random choice"
 PRETRAINING = "random choice while options learn"
 ORACLE_AGENT = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
-BUILT_IN = ("symbols", "ppo")  # choosers that learn; both in a run, their names are told apart as any setting's
+BUILT_IN = ("symbols", "ppo")  # choosers that learn; if a run has both, the setting tells their names apart
 UNIFORM = "uniform-random choice among its own options"
-METHODS = ("D-BAT", "DivDis", "independence", "no diversity", ONE)  # of ensembles
-ORDER = (*METHODS, LEARNED, RANDOM, PRETRAINING, ORACLE_AGENT, ORACLE_RANDOM)  # in tables and figures
+METHODS = ("D-BAT", "DivDis", "independence", "no diversity", ONE)  # methods of ensembles
+ORDER = (*METHODS, LEARNED, RANDOM, PRETRAINING, ORACLE_AGENT, ORACLE_RANDOM)  # order in tables and figures
 
 
 def ensemble_title(config: Values) -> str:
-    """An ensemble by its objective and its number of members."""
+    """Return an ensemble's title: its objective and its number of members."""
     if config["members"] == 1:
         return ONE
     objective = OBJECTIVES.get(config["diversity"], config["diversity"])
@@ -50,7 +50,7 @@ def ensemble_title(config: Values) -> str:
 
 
 def agent_title(kind: str, config: Values) -> str:
-    """An agent by how it chooses and what ends its options."""
+    """Return an agent's title: how it chooses, and what ends its options."""
     if kind == "baseline":
         return f"{config['agent'].upper()} {config['setting']}"
     if kind == "options":
@@ -63,7 +63,7 @@ def agent_title(kind: str, config: Values) -> str:
 
 
 def rank(name: str) -> int:
-    """The order of methods in tables and figures: the paper's method, its controls, anything else."""
+    """Return a method's place in tables and figures: first the paper's method, then its controls, then all else."""
     starts = [start for start in ORDER if name.startswith(start)]
     return ORDER.index(max(starts, key=len)) if starts else len(ORDER)
 
@@ -73,10 +73,10 @@ def names_apart(
     configs: Sequence[Values],
     groups: Sequence[Any] = (),
 ) -> list[str]:
-    """A name for each of n things: its title, and the settings by which it differs from most of that title.
+    """Return a name for each of n things: its title, and the settings by which it differs from most with that title.
 
-    ``domain_config`` inside the settings is looked into. Of several ``groups`` (N) only things of the same are named
-    apart. An ensemble stands without the setting's name, and in place of ``LEARNED``.
+    The settings inside ``domain_config`` count, too. If there are ``groups`` (N), only things of one N are named apart.
+    An ensemble's name stands without the setting's name, and takes the place of ``LEARNED``.
     """
     names = pd.Series(titles, dtype=str)
     settings = pd.DataFrame([_texts(config) for config in configs])
@@ -93,7 +93,7 @@ def names_apart(
 
 
 def _texts(config):
-    """The settings that tell runs apart."""
+    """Return the settings that tell runs apart, as texts."""
     flat = {**(config.get("domain_config") or {}), **config}
     unsaid = NOT_A_VARIANT
     if config.get("members") == 1:
@@ -104,20 +104,20 @@ def _texts(config):
 
 
 def as_text(value: Any) -> str:
-    """A setting's value."""
+    """Return the value of a setting as a text."""
     if value is None:
         return "unset"
     return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
 
 
 def groups_of(config: Values) -> int | None:
-    """N, the number of labelled ladder groups that an ensemble's data have; None where its domain has no such thing."""
+    """Return N, the number of labelled ladder groups in an ensemble's data, or None if its domain has no ladders."""
     groups = (config.get("domain_config") or {}).get("groups")
     return groups if isinstance(groups, int) else None
 
 
 def places_of(contents: Contents) -> dict[Path, dict[str, Any]]:
-    """Of each of a run's artefacts, by path, what stands in the table of numbers: method, N, ladder, layout, seed."""
+    """Return, by an artefact's path, its fields in the table of numbers: method, N, ladder, layout, seed, artefact."""
     configs: list[Values] = [ensemble.config for ensemble in contents.ensembles]
     names = names_apart([*map(ensemble_title, configs)], configs)
     places: list[dict[str, Any]] = [{"N": number} for number in map(groups_of, configs)]

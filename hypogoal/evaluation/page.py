@@ -1,6 +1,6 @@
 """What a page and a terminal's tables are made from: results, how numbers are written, templates, pictures.
 
-Every sentence is in ``templates/``; a question gives its template what it computed.
+Every sentence is in ``templates/``. A question gives its template the numbers that it computed.
 """
 
 import io
@@ -25,29 +25,29 @@ from hypogoal.core.artefacts import versions
 from hypogoal.evaluation import pictures
 from hypogoal.evaluation.plots import slug, styled, to_file
 
-WIDTH = 80  # of tables in a terminal
+WIDTH = 80  # columns of a table in a terminal
 DASH = "–"
 TEMPLATES = Path(__file__).with_name("templates")
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure, drawn once somebody looks; ``name`` is its file's, and the id on the page."""
+    """A figure, which is drawn when somebody looks at it. ``name`` is the name of its file, and its id on the page."""
 
     name: str
-    label: str  # what it shows
+    label: str  # what the figure shows
     draw: Callable[[], Figure]
-    about: Mapping[str, Any] = field(default_factory=dict)  # for its caption
+    about: Mapping[str, Any] = field(default_factory=dict)  # for the caption
 
     @cached_property
     def figure(self) -> Figure:
-        """What is drawn."""
+        """The figure, drawn."""
         with styled():
             return self.draw()
 
     @cached_property
     def svg(self) -> bytes:
-        """Its file."""
+        """The figure's SVG file."""
         return to_file(self.figure, "svg")
 
 
@@ -57,12 +57,15 @@ def fixed(
     scale: float = 1.0,
     sign: str = "",
 ) -> str:
-    """A number with a fixed number of decimals; a dash where there is none. ``sign``: as Python formats it."""
+    """Return ``scale * value`` with ``digits`` decimals, or a dash if ``value`` is missing.
+
+    ``sign`` is Python's format of a sign.
+    """
     return DASH if pd.isna(value) else f"{scale * value:{sign}.{digits}f}"
 
 
 def percent(value: Any) -> str:
-    """0.953 -> '95 %'."""
+    """Return a share as a percentage: 0.953 gives '95 %'."""
     return f"{fixed(value, 0, 100)} %"
 
 
@@ -71,12 +74,15 @@ def between(
     high: Any,
     *how: Any,
 ) -> str:
-    """An interval; nothing where there is none. ``how``, here and below: digits and scale, see :func:`fixed`."""
+    """Return an interval in brackets, or an empty text if ``low`` is missing.
+
+    ``how``, here and in the functions below: the digits and the scale, see :func:`fixed`.
+    """
     return "" if pd.isna(low) else f" [{fixed(low, *how)}, {fixed(high, *how)}]"
 
 
 def mean(row: Any, *how: Any) -> str:
-    """The mean."""
+    """Return the mean of a row of statistics."""
     return fixed(row["mean"], *how)
 
 
@@ -85,21 +91,21 @@ def spread(
     *how: Any,
     error: str = "standard_error",
 ) -> str:
-    """The mean and, where there are several values, beside it their standard error."""
+    """Return the mean and, if a row has several values, their standard error beside it."""
     around = "" if pd.isna(row[error]) else f" ± {fixed(row[error], *how)}"
     return mean(row, *how) + around
 
 
-deviation = partial(spread, error="standard_deviation")  # beside the mean the standard deviation over seeds
+deviation = partial(spread, error="standard_deviation")  # the mean with the standard deviation over seeds
 
 
 def bounded(row: Any, *how: Any) -> str:
-    """The mean of shares or the median of all else, and its 95 % interval."""
+    """Return the estimate of a row, the mean of shares or the median of all else, with its 95 % interval."""
     return fixed(row["estimate"], *how) + between(row["low"], row["high"], *how)
 
 
 def counted(row: Any) -> str:
-    """How many runs there are."""
+    """Return how many runs a row has."""
     return str(row["n"])
 
 
@@ -108,10 +114,10 @@ def displayed(
     by: dict[str, str],
     columns: Mapping[str, Any],
 ) -> DataFrame:
-    """A table of :func:`statistics.over` as people read it: a row for each combination of ``by``, with titles.
+    """Return a table of :func:`statistics.over` as people read it: a row for each combination of ``by``, with titles.
 
-    ``columns`` are by title a quantity, and a function that writes a row's statistics with its further arguments.
-    Labels that are the same everywhere are left out but the method's.
+    ``columns`` are, by title, a quantity and a function that writes a row's statistics, with the further arguments of
+    the function. A label that has one value in all rows is left out, except the method.
     """
     names = [name for name in by if name == "method" or table[name].nunique(dropna=False) > 1]
     shown = table[names].drop_duplicates()
@@ -129,13 +135,16 @@ def displayed(
 
 
 def rows_of(frame: DataFrame) -> list[list[str]]:
-    """The rows of a displayed table, labels first, see :func:`sparse`."""
+    """Return the rows of a displayed table, labels first, see :func:`sparse`."""
     rows = frame.reset_index(allow_duplicates=True)
     return sparse(rows.to_numpy(), frame.index.nlevels)
 
 
 def sparse(rows: Any, labels: int) -> list[list[str]]:
-    """Rows as texts; so many ``labels`` of each but the last are left out where they are as in the row above."""
+    """Return rows as texts. A label that repeats the row above is empty.
+
+    The first ``labels`` columns are labels; the last label is always written.
+    """
     table = DataFrame(rows).map(str)
     first = table.iloc[:, : labels - 1]
     repeated = first.eq(first.shift()).cummin(axis=1)
@@ -144,14 +153,14 @@ def sparse(rows: Any, labels: int) -> list[list[str]]:
 
 
 def terminal(title: str, frame: DataFrame, note: str | None = None) -> Table:
-    """A displayed table for a terminal, 80 columns wide: of its first columns as many as fit, means alone.
+    """Return a displayed table for a terminal, 80 columns wide.
 
-    ``note``: what stands below it.
+    The table has as many of the first columns as fit, and means without what is beside them. ``note`` stands below it.
     """
     frame = frame.map(lambda text: re.split(r" ±| \[", text)[0])
     labels = min(40, max(len(" | ".join(map(str, np.atleast_1d(key)))) for key in frame.index))
     wide = [3 + max(len(str(name)), *map(len, frame[name])) for name in frame]
-    frame = frame.loc[:, labels + 4 + np.cumsum(wide) <= WIDTH]  # with the borders of the labels
+    frame = frame.loc[:, labels + 4 + np.cumsum(wide) <= WIDTH]  # 4 columns are the borders of the labels
     printed = Table(title=title, title_justify="left", caption=note, caption_justify="left", width=WIDTH)
     for name in frame.index.names:
         printed.add_column(str(name), overflow="fold")
@@ -163,7 +172,10 @@ def terminal(title: str, frame: DataFrame, note: str | None = None) -> Table:
 
 
 def plain(tables: Any) -> list[str]:
-    """Tables for a terminal as lines of plain text, the same on every machine; brackets are no mark-up."""
+    """Return tables for a terminal as lines of plain text, which do not depend on the machine.
+
+    Brackets in the tables are no mark-up.
+    """
     console = Console(
         width=WIDTH,
         record=True,
@@ -178,7 +190,7 @@ def plain(tables: Any) -> list[str]:
 
 
 def listed(items: Iterable[Any]) -> str:
-    """1, 2 and 3."""
+    """Return the items as a list in words, such as '1, 2 and 3'. Without items, return 'none'."""
     texts = [str(item) for item in items]
     if len(texts) < 2:
         return texts[0] if texts else "none"
@@ -186,7 +198,7 @@ def listed(items: Iterable[Any]) -> str:
 
 
 def spans(numbers: Iterable[int]) -> str:
-    """Seeds in order, three and more in a row as '970 to 972'."""
+    """Return seeds in order, in words. Three or more in a row are written as '970 to 972'."""
     values = np.unique([*numbers])
     gaps = np.flatnonzero(np.diff(values) > 1)
     texts = []
@@ -196,24 +208,27 @@ def spans(numbers: Iterable[int]) -> str:
 
 
 def picture(image: Any) -> str:
-    """An observation uint8 (H, W, C) as the source of an ``img``, see :func:`pictures.encoded`."""
+    """Return an observation, uint8 (H, W, C), as the source of an ``img``, see :func:`pictures.encoded`."""
     return source(pictures.encoded(image), "webp")
 
 
 def source(data: bytes, kind: str) -> str:
-    """A picture's file as the source of an ``img``."""
+    """Return the content of a picture's file as the source of an ``img``."""
     return f"data:image/{kind};base64,{b64encode(data).decode()}"
 
 
 def digest(text: str) -> str:
-    """A script or a style of the page, as a browser's policy names it."""
+    """Return the hash by which a browser's content policy allows a script or a style of the page."""
     hashed = sha256(text.encode()).digest()
     return f"'sha256-{b64encode(hashed).decode()}'"
 
 
 @cache
 def templates(folder: Path) -> jinja2.Environment:
-    """All templates; they may call whatever is in this module. Pages escape every text but our style and script."""
+    """Return the environment of all templates, which may call whatever is in this module.
+
+    Pages escape every text except our style and script.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(folder),
         autoescape=jinja2.select_autoescape(),
@@ -226,7 +241,7 @@ def templates(folder: Path) -> jinja2.Environment:
 
 
 def words_of(context: Mapping[str, Any]) -> Any:
-    """What a question's template sets, and its macros; figures are not drawn for it."""
+    """Return what a question's template sets, and its macros. No figures are drawn for this."""
     template = templates(TEMPLATES).get_template(f"{context['name']}.html")
     return template.make_module(
         {
@@ -237,25 +252,25 @@ def words_of(context: Mapping[str, Any]) -> Any:
 
 
 def render(template: str, /, **context: Any) -> str:
-    """A template's text. A page, of ``title`` and ``sections``, is one HTML file that needs nothing else.
+    """Return the text of a template. A page, of ``title`` and ``sections``, is one HTML file that needs nothing else.
 
-    A section is what its template is given, with ``name``, its id, ``title``, and whether it is ``folded``;
-    ``template``: where that is not called as the section.
+    A section is what its template is given, with ``name`` (its id), ``title``, and whether it is ``folded``. If a
+    section's template does not have the section's name, ``template`` names it.
     """
     return templates(TEMPLATES).get_template(template).render(context)
 
 
 def lines_of(template: str, /, **context: Any) -> list[str]:
-    """What a template of lines says."""
+    """Return the lines of a template's text that are not empty."""
     return [line for line in render(template, **context).splitlines() if line]
 
 
 def write(folder: Path, text: str, figures: Iterable[Drawn]) -> None:
-    """Write a page, ``index.html``, and those of the figures that are drawn in it as files beside it."""
+    """Write a page, ``index.html``, and beside it a file of each figure that was drawn in the page."""
     (folder / "index.html").write_text(text, encoding="utf-8")
     (folder / "figures").mkdir()
     for drawn in figures:
-        if "svg" not in vars(drawn):  # nobody has looked at it
+        if "svg" not in vars(drawn):  # the page did not draw the figure
             continue
         path = folder / "figures" / f"{slug(drawn.name)}.svg"
         path.write_bytes(drawn.svg)

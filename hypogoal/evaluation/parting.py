@@ -1,6 +1,6 @@
-"""The hypotheses themselves: states on which members part, what each says of them, and which one the agent went by.
+"""The hypotheses: states on which members disagree, what each member says of them, and which member the agent went by.
 
-The states are held-out ones of the ensemble whose options were learned most often, written by :func:`saliency.look`.
+The states are held-out states of the ensemble whose options were learned most often. :func:`saliency.look` writes them.
 """
 
 import posixpath
@@ -23,9 +23,9 @@ from hypogoal.evaluation.selection import SCOPE
 from hypogoal.evaluation.verdict import MARGIN
 
 TITLE = "What the hypotheses say"
-SHOWN = 6  # states of a sub-goal that are open on the page
+SHOWN = 6  # states of a sub-goal that the page shows without unfolding
 PLACES = ("layout_seed", "room", "kind")  # origins whose values take turns
-OF_MEMBERS = {  # a column of the table of members: scope and quantity; the first that the run has
+OF_MEMBERS = {  # columns of the table of members, each the first scope and quantity that the run has
     "accuracy": [("unseen", "balanced_accuracy"), (HELDOUT, "balanced_accuracy")],
     "match": [(SCOPE, "match")],
     "chosen": [(SCOPE, "chosen")],
@@ -38,7 +38,10 @@ def states_to_show(
     sub_goal: str,
     most: int,
 ) -> tuple[list[str], Ints]:
-    """States of the gallery, those of the figures first, and what kinds these are; unseen ones if some are positive."""
+    """Return the kinds of the states that figures show, and the states of the gallery, int64 (n,), those first.
+
+    States of figures are in rooms that no training set saw, if any of these is positive.
+    """
     labels, origins = judged.labels, judged.origins
     allowed = origins.get("seen", np.zeros(len(labels))) == 0
     if not labels[allowed].any():
@@ -61,10 +64,11 @@ def pick_to_explain(
     labels: Bools,
     allowed: Bools,
 ) -> dict[str, int]:
-    """Figures 2 and 9: the few of N states, by kind, whose attributions are drawn, no state twice.
+    """Return, by kind, the few of N states whose attributions Figures 2 and 9 draw. No state is picked twice.
 
-    ``true positive``: where most of K members are right and surest on average; ``disagree``: where members differ and
-    their probabilities are furthest apart; ``false positive``: where most err, and are surest. Fewer where none are.
+    ``true positive``: most of K members are right, and members are surest on average. ``disagree``: members differ, and
+    their probabilities are furthest apart. ``false positive``: most members err, and members are surest on average. A
+    kind may lack a state.
     """
     positive = predictions.sum(axis=1)
     some = positive > 0
@@ -85,7 +89,7 @@ def pick_to_explain(
 
 
 def outcomes(predictions: Bools, labels: Bools) -> Any:
-    """Of predictions (n, K) of labels (n,): whether all members are right, all wrong, or they disagree."""
+    """Return whether all members are right, all wrong, or disagree, as texts (n,), for predictions (n, K)."""
     errors = (predictions != labels[:, None]).sum(axis=1)
     return np.select([errors == 0, errors == predictions.shape[1]], ["all right", "all wrong"], "disagree")
 
@@ -96,9 +100,9 @@ def pick_for_gallery(
     places: Mapping[str, Ints],
     rng: np.random.Generator,
 ) -> Ints:
-    """States by how interesting they are, int64 (N,): kinds of outcome take turns, and within each the places.
+    """Return states in the order of their interest, int64 (N,): kinds of outcome take turns, and then the places.
 
-    Takes predictions (N, K), labels (N,), places (N,) each. States on which all members are right come last; ``rng``
+    Takes predictions (N, K), labels (N,), places (N,) each. States on which all members are right come last. ``rng``
     draws among states alike.
     """
     kinds = pd.DataFrame({"outcome": outcomes(predictions, labels), "label": labels})
@@ -111,7 +115,7 @@ def pick_for_gallery(
 
 
 def context(results):
-    """For the template: of each sub-goal its members and the states on which they part; all states of the gallery."""
+    """Return each sub-goal's members and the states on which they disagree, and all states of the gallery."""
     looked_at = results.facts.get("looked_at")
     if looked_at is None:
         return {}
@@ -123,12 +127,12 @@ def context(results):
         every += states
         members = members_of(results.of(artefact=[ensemble["artefact"], agent], sub_goal=name))
         sub_goals.append({"name": name, "members": members, "parted": parted(states), **went_by(members["chosen"])})
-    pursued = sorted(sub_goals, key=itemgetter("rare"))  # these first
+    pursued = sorted(sub_goals, key=itemgetter("rare"))  # sub-goals that were pursued come first
     return {"ensemble": ensemble, "agent": agent, "sub_goals": pursued, "states": every}
 
 
 def agent_of(results: Results, ensemble: str) -> str:
-    """The path of the first agent that learned to choose among an ensemble's options; empty if there is none."""
+    """Return the path of the first agent that learned to choose among an ensemble's options, or an empty text."""
     learned = results.of(method=[*chosen_by(results, "learned")])["artefact"].unique()
     for artefact in results.facts["provenance"]["artefacts"]:
         sources = [posixpath.normpath(f"{artefact['path']}/{entry['relative']}") for entry in artefact["inputs"]]
@@ -138,9 +142,9 @@ def agent_of(results: Results, ensemble: str) -> str:
 
 
 def members_of(numbers: pd.DataFrame) -> pd.DataFrame:
-    """A row for each member of a sub-goal, with ``OF_MEMBERS``, and the planted ``feature`` that it tells best.
+    """Return a row for each member of a sub-goal, with ``OF_MEMBERS``, and the planted ``feature`` that it tells best.
 
-    ``tells``: the balanced accuracy with which it does. NaN is what the run does not have.
+    ``tells`` is the balanced accuracy with which the member tells that feature. NaN is what the run does not have.
     """
     wide = numbers.pivot_table("value", "member", ["scope", "quantity"])
     columns = {}
@@ -156,10 +160,10 @@ def members_of(numbers: pd.DataFrame) -> pd.DataFrame:
 
 
 def went_by(chosen: pd.Series) -> dict[str, Any]:
-    """How many ``times`` an agent took an option of some members, and whether these are too few, ``rare``, to say more.
+    """Return how many ``times`` an agent took an option of some members, and whether that is too ``rare`` to say more.
 
-    Else also ``most``: the member whose option it took most often, its ``share`` of them, and whether it ``led``: its
-    share is above an even one by ``MARGIN``.
+    If it is not, return also the member whose option was taken ``most``, its ``share``, and whether it ``led``, that
+    is, its share is above an even one by more than ``MARGIN``.
     """
     times = chosen.sum()
     even = 1 / len(chosen)
@@ -170,7 +174,7 @@ def went_by(chosen: pd.Series) -> dict[str, Any]:
 
 
 def parted(states: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The first states on which members disagree: each way to disagree once before any comes again."""
+    """Return the first states on which members disagree. Each way to disagree comes once before any comes again."""
     differ = [state for state in states if state["outcome"] == "disagree"]
     says = pd.Series([state["predictions"].tobytes() for state in differ], dtype=object)
     turn = says.groupby(says).cumcount()
@@ -178,7 +182,10 @@ def parted(states: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def states_of(results: Results, sub_goal: str, facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Each state of the gallery with its arrays, those of attributions if it has any; none of numbers alone."""
+    """Yield each state of the gallery with its arrays. Only the first states have attributions.
+
+    Nothing is yielded if observations are numbers.
+    """
     arrays = results.within(f"saliency/{sub_goal}")
     if "observations" not in arrays:
         return

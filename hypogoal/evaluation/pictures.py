@@ -1,4 +1,4 @@
-"""States as pictures: single ones, attributions over them, many over each other."""
+"""States as pictures: single states, attributions over a state, and many states laid over each other."""
 
 import io
 from typing import Any
@@ -16,17 +16,20 @@ SIGNED = LinearSegmentedColormap.from_list(
     "against-for",
     [BLUE, "white", VERMILLION],
     N=25,
-)  # few: small files
+)  # few colours, so that files are small
 STRONGEST = 0.995  # the quantile of absolute attributions that has full colour
 SHADE = 0.28  # how dark the brightest pixels of a state make the attributions over them
-FEW = 200  # states whose median is taken for what is usual
+FEW = 200  # about how many states the median is taken of
 
 
 def last_frame(
     values: Any,
     colours: int | None = None,
 ) -> Any:
-    """Of pictures (..., C) the last frame's channels, so many ``colours``: by default 3 where C is 3, else 1."""
+    """Return the channels of the last frame of pictures (..., C), (..., ``colours``).
+
+    By default, ``colours`` is 3 if C is 3, and 1 otherwise.
+    """
     default = 3 if values.shape[-1] == 3 else 1
     return values[..., -(colours or default) :]
 
@@ -35,13 +38,13 @@ def coloured(
     observations: Bytes,
     colours: int | None = None,
 ) -> Bytes:
-    """Observations (..., C) as they are shown, (..., 3): of the last frame."""
+    """Return the last frame of observations (..., C) as it is shown, (..., 3)."""
     shown = last_frame(observations, colours)
     return shown if shown.shape[-1] == 3 else shown.repeat(3, axis=-1)
 
 
 def picture_of(state: Any) -> Bytes | None:
-    """A state's pictures side by side, uint8 (H, W, 3); None without any."""
+    """Return a state's pictures side by side, uint8 (H, W, 3), or None if the state has none."""
     parts = []
     for key, (dtype, _) in fields_of(state.shape, state.dtype).items():
         if dtype == PICTURE:
@@ -57,7 +60,10 @@ def picture_of(state: Any) -> Bytes | None:
 
 
 def encoded(image: Bytes) -> bytes:
-    """An observation (H, W, C) for the page: a WebP file without loss, reduced to at most ``MOST_SIDE`` pixels."""
+    """Return an observation (H, W, C) as a WebP file for the page.
+
+    The file has no loss, except that the picture is reduced to a side of at most ``MOST_SIDE`` pixels.
+    """
     picture = Image.fromarray(np.ascontiguousarray(coloured(image)))
     times = -(-max(picture.size) // MOST_SIDE)
     buffer = io.BytesIO()
@@ -70,9 +76,9 @@ def attribution_image(
     state: Bytes,
     colours: int | None = None,
 ) -> Bytes:
-    """Figures 2 and 9: attributions (H, W, C) to the last frame of a state (H, W, C), uint8 (H, W, 3).
+    """Draw Figures 2 and 9: attributions (H, W, C) to the last frame of a state (H, W, C), as uint8 (H, W, 3).
 
-    Orange where positive, blue where negative, white where none; the state shows through as a light shade.
+    Positive attributions are orange, negative ones blue, and 0 is white. The state shows through as a light shade.
     """
     summed = last_frame(values, colours).sum(axis=-1)
     size = float(np.quantile(np.abs(summed), STRONGEST)) or 1.0
@@ -83,16 +89,16 @@ def attribution_image(
 
 
 def overlay(states: Bytes) -> Bytes:
-    """Figures 7 and 8: termination states uint8 (n, H, W, C), n at least 1, laid over each other.
+    """Draw Figures 7 and 8: termination states, uint8 (n, H, W, C) with n at least 1, laid over each other.
 
-    The state with the fewest unusual pixels is drawn whole. Over it, half transparent, is what the others show that is
-    unusual: agents in other cells, say. A pixel is usual that is as in the median state.
+    A pixel is usual if it is as in the median state. The state with the fewest unusual pixels is drawn whole. The
+    unusual pixels of the others, such as agents in other cells, are drawn over it, half transparent.
     """
     few = states[:: max(1, len(states) // FEW)]
     middle = len(few) // 2
     usual = np.partition(few, middle, axis=0)[middle]
     unusual = states != usual
-    if states.shape[-1] == 3:  # a colour is one thing, a stack's frames are several
+    if states.shape[-1] == 3:  # the channels of a colour count together; those of a stack are several frames
         red, green, blue = np.split(unusual, 3, axis=-1)
         unusual = red | green | blue
     whole = unusual.sum(axis=(1, 2, 3)).argmin()

@@ -1,4 +1,4 @@
-"""The kit of figures: their look, and how they are written."""
+"""The look of figures, and how figures are written."""
 
 import io
 import re
@@ -16,9 +16,9 @@ from hypogoal.core.arrays import Bytes
 INK = "#24272b"
 BLUE, VERMILLION, GREEN = "#0072b2", "#d55e00", "#009e73"
 PURPLE, ORANGE, SKY, GREY = "#cc79a7", "#e69f00", "#56b4e9", "#808890"
-PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)  # of methods; grey is for what is no method
+PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)  # colours of methods; what is no method is grey
 WIDTH = 5.6  # inches; readable on a phone, where it is scaled to the screen
-# Formats of files, and what they would say of when and by what they were written.
+# Formats of files, and their fields that would say when and by what a file was written.
 UNDATED = {
     "svg": ("Date", "Creator"),
     "pdf": ("CreationDate", "Producer", "Creator"),
@@ -28,16 +28,16 @@ DOTTED: dict[str, Any] = {
     "color": GREY,
     "linestyle": ":",
     "linewidth": 1.2,
-}  # a line of what is no method
+}  # for a line that is no method's
 
 
 def styled() -> AbstractContextManager[None]:
-    """What all figures have in common, whatever a notebook has set."""
+    """Give all figures our style within the block, whatever a notebook has set."""
     return matplotlib.style.context(["default", "hypogoal.evaluation.hypogoal"])
 
 
 def plot(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
-    """A figure with one plot."""
+    """Return a new figure with one plot, and the plot."""
     figure = Figure(figsize=(width, height))
     return figure, figure.subplots()
 
@@ -48,7 +48,10 @@ def bars(
     height: float,
     **errors: Any,
 ) -> tuple[Figure, Axes]:
-    """Bars of each method (a column) side by side at each place (a row), ``bar`` or ``barh``, with their errors."""
+    """Draw bars of each method (a column) side by side at each place (a row). Return the figure and its plot.
+
+    ``kind`` is ``bar`` or ``barh``; ``errors`` are the lengths of error bars.
+    """
     figure, axes = plot(height)
     means.plot(kind=kind, ax=axes, alpha=0.8, rot=0, legend=False, **errors)
     legend_below(figure, 2)
@@ -56,7 +59,7 @@ def bars(
 
 
 def legend_below(figure: Figure, columns: int) -> None:
-    """A legend under the plots, each label once; the figure becomes higher by its lines."""
+    """Add a legend under the plots, with each label once. The figure grows by the height of the legend."""
     by_label: dict[str, Any] = {}
     for place in figure.axes:
         handles, labels = place.get_legend_handles_labels()
@@ -73,7 +76,10 @@ def panels(
     columns: int,
     titles: float = 0.34,
 ) -> tuple[Figure, list[Axes]]:
-    """Pictures by their titles, row by row; ``titles``: inches above each. Of a stack of grey frames the last."""
+    """Draw pictures with their titles, row by row. Return the figure and its plots.
+
+    ``titles`` is the space above each picture in inches. Of a stack of grey frames, the last is drawn.
+    """
     side = WIDTH / max(columns, 3)
     rows = -(-len(shown) // columns)
     figure = Figure(figsize=(side * columns, rows * (side + titles)))
@@ -87,13 +93,16 @@ def panels(
 
 
 def slug(text: str) -> str:
-    """An id, or a file's name without its ending: of other signs than letters, digits, - and _ a digest is left."""
+    """Return ``text`` as an id, or as the name of a file without its ending.
+
+    If the text has other signs than letters, digits, - and _, or is longer than 80, a digest is added.
+    """
     plain = re.sub(r"[^\w-]+", "-", text)[:80]
     return text if plain == text else f"{plain}-{blake2b(text.encode(), digest_size=4).hexdigest()}"
 
 
 def to_file(figure: Figure, kind: str) -> bytes:
-    """The figure as ``svg``, ``png`` (on white) or ``pdf``; the same bytes each time."""
+    """Return the figure as a ``svg``, ``png`` (on white) or ``pdf`` file, with the same bytes each time."""
     buffer = io.BytesIO()
     with styled():
         figure.savefig(buffer, format=kind, metadata=dict.fromkeys(UNDATED[kind]))

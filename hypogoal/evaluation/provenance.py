@@ -1,4 +1,4 @@
-"""What everything was made from and with."""
+"""Where everything in a run comes from: data, artefacts, settings and versions."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from hypogoal.evaluation.names import as_text
 from hypogoal.evaluation.run import Contents, Results
 
 TITLE = "Data, settings, provenance"
-KEPT = {"kind", "seed", "config", "inputs", "command", "versions"}  # of a manifest
+KEPT = {"kind", "seed", "config", "inputs", "command", "versions"}  # fields of a manifest
 
 
 def provenance(contents: Contents) -> dict[str, Any]:
-    """What everything was made from and with."""
+    """Return what each artefact and each data file of a run was made from and with."""
     artefacts = []
     for artefact in (*contents.everything(), *contents.continued):
         kept = artefact.manifest.model_dump(include=KEPT)
@@ -27,13 +27,13 @@ def provenance(contents: Contents) -> dict[str, Any]:
 
 
 def domains_of(results: Results) -> list[str]:
-    """The domains of a run's artefacts."""
+    """Return the names of the domains of a run's artefacts, sorted."""
     artefacts = results.facts["provenance"]["artefacts"]
     return sorted({artefact["config"]["domain"] for artefact in artefacts})
 
 
 def settings_of(results: Results) -> pd.DataFrame:
-    """Each value that a setting has in a run: columns ``of`` (a kind of artefact, data, versions), setting, text."""
+    """Return each value of each setting in a run: columns ``of`` (artefact's kind, data or versions), setting, text."""
     recorded = results.facts["provenance"]
     parts = [("data", {"seed": data["seed"], **data["config"]}) for data in recorded["data"]]
     for artefact in recorded["artefacts"]:
@@ -44,12 +44,12 @@ def settings_of(results: Results) -> pd.DataFrame:
                 parts.append(("data", {"sha256": item["sha256"][:10]}))
     rows = []
     for kind, settings in parts:
-        for name in ("domain_config", "chosen"):  # the data's own, and what came out
+        for name in ("domain_config", "chosen"):  # the data have domain_config themselves; chosen is a result
             settings.pop(name, None)
         rows += [(kind, name, as_text(value)) for name, value in settings.items()]
     return pd.DataFrame(rows, columns=["of", "setting", "text"]).drop_duplicates()
 
 
 def context(results):
-    """For the template: what was collected, the artefacts, and settings."""
+    """Return what the template needs: what was collected, the artefacts, and settings."""
     return results.facts["provenance"] | {"settings": settings_of(results)}

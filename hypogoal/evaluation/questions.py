@@ -1,13 +1,15 @@
-"""Which questions of the paper an evaluation answers: a new one is a file of its own, its template, and a line here.
+"""Which questions of the paper an evaluation answers. A new question needs a module, a template, and a line here.
 
-A question is a module with ``TITLE`` and ``context(results)``, of :class:`run.Results`: by name what its template
-needs, nothing where the run has nothing of it. These names are known here:
+A question is a module with ``TITLE`` and ``context(results)``, where ``results`` is a :class:`run.Results`. The context
+has what the template needs, by name; it is empty if the run has nothing for the question. Some names have a meaning
+here:
 
-- ``table``: each run's numbers, of :func:`table.per_run`, over which :func:`statistics.over` goes; written as a file.
-- ``compared``: those of each run's numbers whose pairs, ``pairs``, its table of pairs has.
-- ``figures``: :class:`page.Drawn` ones, of which its template's macro ``caption`` says what they show.
+- ``table``: the table of :func:`statistics.over` over the numbers of :func:`table.per_run`; written as a file.
+- ``compared``: each run's numbers of which pairs are compared, in the table ``pairs``.
+- ``figures``: instances of :class:`page.Drawn`. The template's macro ``caption`` says what each shows.
 
-Its template sets ``shown``, what a terminal prints, unless it is folded, and may set ``note``, the words below that.
+The template sets ``shown``, which a terminal prints unless the question is folded. It may set ``note``, which is
+printed below.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -44,22 +46,22 @@ from hypogoal.evaluation import (
 )
 
 Context = dict[str, Any]  # what a question's template is given
-Rows = Iterable[pd.DataFrame]  # of the table of numbers
+Rows = Iterable[pd.DataFrame]  # parts of the table of numbers
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question: its module, and what puts numbers of its own into the table."""
+    """A question: its module, and the functions that put its own numbers into the table."""
 
     module: ModuleType
     look: Callable[[judging.Work, judging.Judgement], Rows] | None = None  # is called with each sub-goal judged
-    rows: Callable[[judging.Work], Rows] | None = None  # is called once, after all of them
-    folded: bool = False  # on the page until asked for, and not in a terminal
-    beside: bool = False  # told of several runs side by side, too
+    rows: Callable[[judging.Work], Rows] | None = None  # is called once, after all sub-goals were judged
+    folded: bool = False  # whether a reader must unfold the section; a terminal does not print it
+    beside: bool = False  # whether a page of several runs side by side has it, too
 
     @property
     def name(self) -> str:
-        """What its template, its table and its section are called."""
+        """The name of the question's template, table and section."""
         return self.module.__name__.rpartition(".")[-1].replace("_", "-")
 
 
@@ -79,13 +81,13 @@ QUESTIONS = (  # in the order of the page
 
 
 def answers(results: run.Results) -> list[Context]:
-    """Of every question that the run has something of, in the order of the page."""
+    """Return the context of every question that the run has something for, in the order of the page."""
     contexts = [context_of(question, results) for question in QUESTIONS]
     return [context for context in contexts if context]
 
 
 def context_of(question: Question, results: run.Results) -> Context | None:
-    """What a question's template is given; None where the run has nothing of it."""
+    """Return what a question's template is given, or None if the run has nothing for the question."""
     parts = question.module.context(results)
     if not parts:
         return None
@@ -103,7 +105,10 @@ def context_of(question: Question, results: run.Results) -> Context | None:
 
 
 def answer(work: judging.Work, settings: Mapping[str, Any]) -> run.Results:
-    """Every number of a run, and what else its page needs: ensembles are judged, then all questions asked."""
+    """Return every number of a run, and what else its page needs.
+
+    First the ensembles are judged, then all questions are asked.
+    """
     parts: list[pd.DataFrame] = []
     for judgement in work.judgements():
         for question in QUESTIONS:
@@ -130,7 +135,10 @@ def answer(work: judging.Work, settings: Mapping[str, Any]) -> run.Results:
 
 
 def write(folder: Path, results: run.Results, every: list[Context]) -> list[str]:
-    """Write ``numbers.csv``, ``run.json`` and, of :func:`answers`, ``tables/*.csv`` and the summary; return that."""
+    """Write ``numbers.csv``, ``run.json``, ``tables/*.csv`` and the summary. Return the lines of the summary.
+
+    ``every`` is the result of :func:`answers`.
+    """
     results.numbers.to_csv(folder / "numbers.csv", index=False)
     (folder / "run.json").write_text(as_json(results.facts) + "\n", encoding="utf-8")
     tables = {"verdict": pd.DataFrame(verdict.findings(results))}
@@ -147,14 +155,17 @@ def write(folder: Path, results: run.Results, every: list[Context]) -> list[str]
 
 
 def summary(results: run.Results, every: list[Context]) -> list[str]:
-    """The headline numbers of a run, mean over seeds, and the verdict; at most 80 columns wide; agents last."""
+    """Return the lines of a run's summary: headline numbers, as means over seeds, and then the verdict.
+
+    Lines have at most 80 columns.
+    """
     domains = ", ".join(provenance.domains_of(results))
     tables: list[Table | str] = []
     for context in every:
         if context["folded"]:
             continue
         words = page.words_of(context)
-        if not words.shown.empty:  # such as the layouts of a run without agents
+        if not words.shown.empty:  # the table of layouts, for example, in a run without agents
             note = getattr(words, "note", None)
             tables += [page.terminal(f"{context['title']}: {domains}", words.shown, note), ""]
     lines = Table.grid()
@@ -167,16 +178,16 @@ def summary(results: run.Results, every: list[Context]) -> list[str]:
 
 
 def sentences(results: run.Results) -> list[str]:
-    """The verdict, a sentence a line."""
+    """Return the verdict, a sentence a line."""
     return page.lines_of("verdict.txt", **verdict.context(results))
 
 
 def render(results: run.Results, every: list[Context], films: Iterable[Mapping[str, str]]) -> str:
-    """The page of a run, self-contained, with the figures of :func:`answers`."""
+    """Return the page of a run, self-contained, with the figures of ``every``, the result of :func:`answers`."""
     return page.render(
         "run.html",
         title=f"hypogoal: {results.facts['run']}",
-        sections=sorted(every, key=lambda context: context["folded"]),  # what is open comes first
+        sections=sorted(every, key=lambda context: context["folded"]),  # sections that are not folded come first
         sentences=sentences(results),
         films=films,
         domains=provenance.domains_of(results),

@@ -1,8 +1,8 @@
 """Figure 3: members on rooms that training did and did not see, for each number of labelled ladder groups.
 
-The paper scores the best member on files that hold training rooms too, and picks it on the same files. Here every
-score stands on unseen rooms and on all rooms, and beside the best member are the mean, the worst and the one that the
-rooms of the labelled groups, the only ones whose labels were to be had, would have picked.
+The paper scores the best member on files that hold training rooms too, and picks that member on the same files. Here,
+every score is given on unseen rooms and on all rooms. Beside the best member are the mean, the worst, and the member
+that the rooms of the labelled groups would have picked, the only rooms whose labels were to be had.
 """
 
 from functools import partial
@@ -28,7 +28,7 @@ WHICH = {
 BY = ["method", "N", "sub_goal"]
 NEVER = "accuracy, all, never positive"
 PAIRED = [f"balanced_accuracy, unseen, {which}" for which in ("best", "validated", "mean")]
-PANELS = {  # of Figure 3, and what it takes no seeing to score
+PANELS = {  # panels of Figure 3: the quantity, and the title
     "accuracy, all, best": "accuracy, all rooms: best",
     "balanced_accuracy, unseen, best": "balanced, unseen: best",
     "balanced_accuracy, unseen, validated": "balanced, unseen: validated",
@@ -37,7 +37,7 @@ PANELS = {  # of Figure 3, and what it takes no seeing to score
 
 
 def context(results):
-    """Members' scores and disagreement, and what a member that is never positive has; Figure 3."""
+    """Return members' scores and disagreement, the accuracy of a member that is never positive, and Figure 3."""
     by_room = results.of(scope="unseen")["artefact"]
     if by_room.empty:
         return {}
@@ -56,7 +56,7 @@ def context(results):
 
 
 def _figures(table):
-    """Figure 3, and what it leaves out, of each sub-goal."""
+    """Yield Figure 3 for each sub-goal."""
     sub_goals = table["sub_goal"].unique()
     for sub_goal in sub_goals:
         rows = table[table["sub_goal"] == sub_goal].dropna(subset="N")
@@ -71,9 +71,9 @@ def _figures(table):
 
 
 def scores_over_groups(table: pd.DataFrame) -> Figure:
-    """Figure 3: scores against the number of labelled ladder groups, a panel for each of ``PANELS``.
+    """Draw Figure 3: scores against the number of labelled ladder groups, a panel for each of ``PANELS``.
 
-    Of a table of :func:`statistics.over`, all of one sub-goal; dotted is a member that is never positive.
+    ``table`` is a table of :func:`statistics.over` with one sub-goal. A member that is never positive is dotted.
     """
     never = table[table["quantity"] == NEVER].drop_duplicates("N").set_index("N")["mean"]
     figure = Figure(figsize=(plots.WIDTH, 4.55))

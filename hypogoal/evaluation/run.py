@@ -20,7 +20,7 @@ from hypogoal.data import opened
 from hypogoal.evaluation.table import EVALUATE_AGAIN, read_numbers
 from hypogoal.options.tables import Executions
 
-FORMAT = 6  # of an evaluation, in its ``run.json``
+FORMAT = 6  # the format of an evaluation, which its ``run.json`` names
 DEPTH = 3  # levels of folders below a run that are searched for artefacts
 
 
@@ -33,14 +33,14 @@ class Results:
     arrays: Mapping[str, Any] = field(default_factory=dict)
 
     def of(self, **fields: Any) -> DataFrame:
-        """The numbers whose columns have these values; a list: any of them."""
+        """Return the rows of ``numbers`` whose columns have the given values. A list stands for any of its values."""
         rows = self.numbers
         for name, value in fields.items():
             rows = rows[rows[name].isin(value if isinstance(value, list) else [value])]
         return rows
 
     def within(self, folder: str) -> dict[str, Any]:
-        """The arrays of a folder, by their names in it."""
+        """Return the arrays of a folder, by their names in the folder."""
         start = f"{folder}/"
         return {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
 
@@ -50,31 +50,31 @@ class Contents:
     """The artefacts of a run that are evaluated."""
 
     run: Path  # its folder
-    ensembles: list[Artefact]  # every one
+    ensembles: list[Artefact]  # all ensembles
     agents: list[Artefact]  # what plays a layout: metas, options that no meta continues, baselines
-    ladders: list[Artefact]  # options learned from a named start each, with a table of where they stopped
-    continued: list[Artefact]  # options that a meta artefact continues, and so is judged by
+    ladders: list[Artefact]  # options that were learned from a named start, with a table of where they stopped
+    continued: list[Artefact]  # options that a meta artefact continues; judging that artefact judges them
 
     def everything(self) -> list[Artefact]:
-        """All of them."""
+        """Return all artefacts that are evaluated."""
         return [*self.ensembles, *self.agents, *self.ladders]
 
     @cached_property
     def data_of(self) -> dict[Path, Path]:
-        """The data file that each ensemble was trained on, by the ensemble's path; each is read to the end once."""
+        """The data file of each ensemble, by the ensemble's path. Each file is read to the end once, for its hash."""
         return {artefact.path: artefact.input("data") for artefact in self.ensembles}
 
     def data(self) -> list[Path]:
-        """The data files that ensembles were trained on."""
+        """Return the data files on which ensembles were trained, sorted."""
         return sorted({*self.data_of.values()})
 
     def name(self, artefact: Artefact) -> str:
-        """Its path within the run."""
+        """Return the path of an artefact within the run."""
         return artefact.path.relative_to(self.run).as_posix()
 
 
 def find_artefacts(run: Path, kind: str) -> list[Artefact]:
-    """All artefacts of a kind below ``run`` and ``run`` itself, sorted by path."""
+    """Return all artefacts of a kind in ``run``, or at most ``DEPTH`` levels below, sorted by path."""
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder of a run.")
     folders = [path.parent for path in visible(run, MANIFEST)]
@@ -83,9 +83,9 @@ def find_artefacts(run: Path, kind: str) -> list[Artefact]:
 
 
 def find(run: Path) -> Contents:
-    """The artefacts to evaluate: options that a meta artefact continues are part of that one.
+    """Return the artefacts to evaluate. Options that a meta artefact continues are part of that artefact.
 
-    None, or a damaged one, is a ``UserError``.
+    Raises ``UserError`` if there are none, or if an artefact is damaged.
     """
     metas = find_artefacts(run, "meta")
     inputs: set[Path] = set()
@@ -106,19 +106,22 @@ def find(run: Path) -> Contents:
 
 
 def takes(artefact: Artefact) -> bool:
-    """Whether it was learned with the predictions of an ensemble's members."""
+    """Return whether an artefact was learned with the predictions of an ensemble's members."""
     return artefact.kind != "baseline" and artefact.config["termination"] != "oracle"
 
 
 def choice_of(artefact: Artefact) -> str:
-    """How a meta artefact chooses among members' options: ``learned`` or ``random``; empty: it does not."""
+    """Return whether a meta artefact's choice among members' options is ``learned`` or ``random``; empty for others."""
     if artefact.kind != "meta" or not takes(artefact):
         return ""
     return "random" if artefact.config["chooser"] == "random" else "learned"
 
 
 def evaluation_of(run: Path) -> Artefact:
-    """The evaluation of a run: that in ``run/evaluation`` where there are several; a ``UserError`` if there is none."""
+    """Return the evaluation of a run. If there are several, it is that in ``run/evaluation``, or else the first.
+
+    Raises ``UserError`` if there is none.
+    """
     evaluations = find_artefacts(run, "evaluation")
     if not evaluations:
         raise UserError("this run was not evaluated", run, f"First run: {command('evaluate', run)}")
@@ -126,9 +129,10 @@ def evaluation_of(run: Path) -> Artefact:
 
 
 def read_evaluation(run: Path) -> Results:
-    """What was found in a run, see :func:`evaluation_of`; its artefacts made since are among what is ``missing``.
+    """Return what was found in a run, see :func:`evaluation_of`.
 
-    A run that was not evaluated, or a damaged evaluation, is a ``UserError``.
+    Artefacts that were made since are among what is ``missing``. Raises ``UserError`` if the run was not evaluated, or
+    if the evaluation is damaged.
     """
     source = evaluation_of(run)
     results = read_results(source)
@@ -141,7 +145,10 @@ def read_evaluation(run: Path) -> Results:
 
 
 def read_results(source: Artefact) -> Results:
-    """The numbers and facts of an evaluation artefact; a ``UserError`` where it is damaged or of another format."""
+    """Return the numbers and facts of an evaluation artefact.
+
+    Raises ``UserError`` if the artefact is damaged or has another format.
+    """
     path = open_artefact(source.path).path / "run.json"
     with reading(path, EVALUATE_AGAIN, "the evaluation"):
         facts = json.loads(path.read_bytes())
@@ -152,7 +159,7 @@ def read_results(source: Artefact) -> Results:
 
 
 def _since(run: Path, source: Artefact) -> list[str]:
-    """A line for each artefact of the run that the evaluation does not know: it was made, or made again, since."""
+    """Return a line for each artefact of the run that was made, or made again, since the evaluation."""
     evaluated = {entry.sha256 for entry in source.manifest.inputs}
     try:
         contents = find(run)

@@ -20,19 +20,20 @@ from hypogoal.evaluation.table import melted
 from hypogoal.observations import PICTURE, fields_of, spread_rows
 
 TITLE = "What members look at"
-MOST_BARS = 15  # features
+MOST_BARS = 15  # features that are drawn
 GALLERY = 40  # states of all sub-goals
-EXPLAINED = 20  # of these with attributions: DeepLift takes .05 s for a state and member
-INTEGRATED = 5  # where they are integrated gradients: of a large network seconds
+EXPLAINED = 20  # states of the gallery with attributions; DeepLift takes .05 s for a state and member
+INTEGRATED = 5  # the number with integrated gradients, which take seconds with a large network
 AVERAGED = 64  # states over which attributions to features are averaged
 
 
 def look(work: judging.Work, judgement: judging.Judgement) -> Iterator[pd.DataFrame]:
-    """What members look at in a few held-out states, of the ensemble whose options were learned most often.
+    """Yield rows on what members look at in a few held-out states, of the ensemble that was learned from most often.
 
-    ``saliency/SUB_GOAL`` is written: states with what members predict, ``seen``, what members saw of the first of them,
-    and ``attributions`` to it, float32 (n, K, H, W, C), in log-odds, against the mean of the unlabelled states. Of
-    numbers, and of pictures and numbers by key, these alone, (n, K, features): a picture's are added up.
+    ``saliency/SUB_GOAL`` is written. If observations are pictures, it has the states with what members predict,
+    ``seen``, which is what members saw of the first of the states, and ``attributions`` to ``seen``, float32 (n, K, H,
+    W, C), in log-odds, against the mean of the unlabelled states. Otherwise it has ``attributions`` alone, (n, K,
+    features), in which those to a picture are added up.
     """
     from hypogoal.hypotheses import deep_lift
     from hypogoal.hypotheses.ensemble import read_ensemble
@@ -81,7 +82,7 @@ def look(work: judging.Work, judgement: judging.Judgement) -> Iterator[pd.DataFr
 
 
 def of_features(values: Floats, dtype: Any) -> Floats:
-    """Attributions (n, K, D) to each number; of mixed observations those to a picture are added up."""
+    """Return attributions (n, K, D) to each number. Of mixed observations, those to a picture are added up."""
     if not dtype.names:
         return values
     features = []
@@ -94,7 +95,7 @@ def of_features(values: Floats, dtype: Any) -> Floats:
 
 
 def context(results):
-    """For the template: whose members, and how they were explained; Figures 2 and 9."""
+    """Return whose members these are, how they were explained, and Figures 2 and 9."""
     looked_at = results.facts.get("looked_at")
     if looked_at is None:
         return {}
@@ -103,7 +104,7 @@ def context(results):
     figures = []
     for name, facts in explained.items():
         suffix = f"-{name}" if len(explained) > 1 else ""
-        first = next(states_of(results, name, facts), None)  # none where only numbers are told
+        first = next(states_of(results, name, facts), None)  # None if observations are numbers
         attributions = results.arrays.get(f"saliency/{name}/attributions")
         if first:
             figures += _figures(first, facts["kinds"][0], suffix)
@@ -114,7 +115,7 @@ def context(results):
 
 
 def _figures(state, kind, suffix):
-    """Figures 2 and 9 of a sub-goal's first state, a true positive where there is one."""
+    """Yield Figures 2 and 9 of a sub-goal's first state, which is a true positive if there is any."""
     about = {"sub_goal": state["sub_goal"], "kind": kind, "place": state["place"]}
     members = partial(attributions_of_members, state)
     yield Drawn(f"figure2{suffix}", "Figure 2: attributions of each member", members, about)
@@ -123,7 +124,10 @@ def _figures(state, kind, suffix):
 
 
 def attributions_of_members(state: Mapping[str, Any]) -> Figure:
-    """Figure 2: a state and what each member goes by in it; of a stack of frames the last."""
+    """Draw Figure 2: a state, and what each member goes by in it.
+
+    Of a stack of frames, the last is drawn.
+    """
     colours = state["colours"]
     truth = "positive" if state["labels"] else "negative"
     shown = [(f"truth\n{truth}", pictures.coloured(state["observations"], colours))]
@@ -133,7 +137,10 @@ def attributions_of_members(state: Mapping[str, Any]) -> Figure:
 
 
 def attributions_of_channels(state: Mapping[str, Any]) -> Figure:
-    """Figure 9: a row per member, a column per frame, oldest first, above them the frames; of one frame its colours."""
+    """Draw Figure 9: a row per member, and a column per frame, oldest first. Above them are the frames.
+
+    If there is one frame of three colours, its columns are the colours.
+    """
     seen = state["seen"]
     channels, names = seen.shape[-1], ["red", "green", "blue"]
     if channels != 3 or channels > state["colours"]:
@@ -149,7 +156,7 @@ def attributions_of_channels(state: Mapping[str, Any]) -> Figure:
 
 
 def _members(state):
-    """What each member says of a state, and its attributions."""
+    """Yield a title that says what each member says of a state, and the member's attributions."""
     for member, values in enumerate(state["attributions"]):
         says = state["predictions"][member]
         wrong = "" if says == state["labels"] else ", wrong"
@@ -158,7 +165,7 @@ def _members(state):
 
 
 def with_key(shown: Sequence[tuple[str, Bytes]], columns: int) -> Figure:
-    """Pictures with titles, row by row; below them what the colours of attributions mean.
+    """Draw pictures with titles, row by row, and below them what the colours of attributions mean.
 
     Each picture has a scale of its own, so the key has no numbers.
     """
@@ -171,7 +178,10 @@ def with_key(shown: Sequence[tuple[str, Bytes]], columns: int) -> Figure:
 
 
 def bars_of_features(attributions: Floats, names: Sequence[str]) -> Figure:
-    """Bars side by side, those of the features that members go by most, of attributions (n, K, features)."""
+    """Draw the size of attributions (n, K, features) as bars, members side by side.
+
+    The features are those that the members go by most.
+    """
     sizes = pd.DataFrame(np.abs(attributions).mean(axis=0).T, index=[*names]).add_prefix("member ")
     most = sizes.mean(axis=1).nlargest(MOST_BARS).index
     figure, axes = plots.bars("barh", sizes.loc[most[::-1]], 0.7 + 0.35 * len(most))

@@ -22,18 +22,18 @@ from hypogoal.observations import PICTURE
 from hypogoal.options.tables import ChoiceCounts
 
 TITLE = "Which hypotheses are chosen, and where they stop"
-LOOKED_AT = 10  # layouts of an agent that has many, the first ones: on their states members are matched with the truth
+LOOKED_AT = 10  # first layouts of an agent that has many, on whose states members are compared with the truth
 NUMBERED = {
     "open-red-door": "figure7",
     "go-to-goal": "figure8",
 }  # the sub-goals that the paper shows
-SCOPE = "layout"  # of choices, and of the match with the truth, on a run's layout
+SCOPE = "layout"  # scope of choices, and of the match with the truth, on a run's layout
 COUNTS = ("offered", "chosen", "reached", "expected")
-NUMBERS = (*COUNTS, "duration", "preference", "match")  # of an option
+NUMBERS = (*COUNTS, "duration", "preference", "match")  # numbers of an option
 
 
 def rows(work):
-    """The choices of every run of each agent whose options are members, and how well these match the truth."""
+    """Yield the choices of each agent whose options are members, and how well the members match the truth."""
     judged = cache(on_layout)
     for artefact in work.contents.agents:
         work.progress.advance()
@@ -50,11 +50,12 @@ def rows(work):
 
 
 def numbers_of_choices(choices: ChoiceCounts, options: int) -> dict[str, Doubles]:
-    """How often each option was offered, chosen, reached; its mean duration in steps; ``preference``, (O,).
+    """Return the numbers of each of O options: ``COUNTS``, the mean ``duration`` in steps, and ``preference``.
 
-    A raw share is confounded: a member that always fires is masked nearly always, one that never fires is offered
-    always. Preference is chosen / expected, 1 for a chooser that does not care, NaN for an option never offered;
-    ``expected``: the sum of 1 / (options offered) over the decisions that offered it.
+    A raw share is confounded: a member that always fires is masked nearly always, and a member that never fires is
+    always offered. ``preference`` (O,) is chosen / expected. It is 1 for a chooser that does not care, and NaN for an
+    option that was never offered. ``expected`` is the sum of 1 / (options offered) over the decisions that offered the
+    option.
     """
     columns = {name: choices.total(name, options) for name in COUNTS}
     columns["duration"] = scores.ratio(choices.total("duration", options), columns["chosen"])
@@ -66,13 +67,14 @@ def on_layout(
     path: Path,
     layouts: tuple[int, ...],
 ) -> tuple[Doubles, dict[int, Bytes]]:
-    """Every member of an ensemble's artefact on the states of layouts: those that can be reached, else that are met.
+    """Return how well each member of an ensemble matches the truth on layouts, and the states where it is positive.
 
-    Returns of each option (G*K,) its balanced accuracy, NaN where the domain does not have the sub-goal but
-    the user's own labels do: its truth is unknown there; and of options that are positive anywhere, where states are
-    pictures, an :func:`overlay` of these.
+    The states are all that can be reached or, if the engine does not know them, those that random play meets. The first
+    result is each option's balanced accuracy (G*K,). It is NaN if the user's own labels define the sub-goal, because
+    the domain does not know its truth. The second result is empty unless states are pictures; then it has, for each
+    option that is positive anywhere, an :func:`overlay` of the positive states.
     """
-    from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report needs not
+    from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report does not need
 
     config = Artefact(path).config
     in_domain = base.load_domain(config["domain"]).sub_goals
@@ -99,7 +101,7 @@ def on_layout(
 
 
 def engine_on(config: Mapping[str, Any], layouts: Sequence[int]) -> base.Engine:
-    """A game on each of some layouts, in the world that an artefact's ``config`` says."""
+    """Return an engine with a game on each of ``layouts``, in the world that an artefact's ``config`` says."""
     domain = base.load_domain(config["domain"])
     world = domain.world(config["domain_config"])
     if len(layouts) > 1:
@@ -112,7 +114,7 @@ def states_met(
     steps: int,
     rng: np.random.Generator,
 ) -> Ints:
-    """The states that random play of an engine meets in so many steps, each once."""
+    """Return the distinct states, int64 (n,), that random play of an engine meets in ``steps`` environment steps."""
     met = [engine.ids]
     for _ in range(steps // engine.count):
         met.append(engine.step(rng.integers(engine.n_actions, size=engine.count)).next_ids)
@@ -120,7 +122,7 @@ def states_met(
 
 
 def missing(work):
-    """Sub-goals of which the domain does not know where they are reached."""
+    """Return a line for each sub-goal that is not known to the domain of an agent."""
     lines = set()
     for artefact in filter(takes, work.contents.agents):
         name = artefact.config["domain"]
@@ -131,7 +133,10 @@ def missing(work):
 
 
 def context(results):
-    """A row of ``table`` for each run's member; ``members``: those of the first run that learned to choose, if any."""
+    """Return ``table``, with a row for each run's member, and the figures.
+
+    ``members`` are the rows of the first run that learned to choose or, if none did, of the first run.
+    """
     numbers = results.of(scope=SCOPE)
     if numbers.empty:
         return {}
@@ -149,7 +154,7 @@ def context(results):
 
 
 def _figures(members, arrays):
-    """Figures 7 and 8 and the other sub-goals': termination states of the most and of the least preferred member."""
+    """Yield a figure per sub-goal (7, 8 and others): where options of the most and the least preferred member stop."""
     path = members["artefact"].min()
     for sub_goal, of_goal in members.dropna(subset="preference").groupby("sub_goal", sort=False):
         preference = of_goal["preference"]
@@ -170,6 +175,6 @@ def _figures(members, arrays):
 
 
 def side_by_side(sides):
-    """Two pictures at most, by their titles."""
+    """Draw at most two pictures, given by their titles."""
     figure, _ = plots.panels(sides.items(), 2, titles=0.6)
     return figure

@@ -15,9 +15,9 @@ from hypogoal.evaluation.table import SHARED, shares
 LOWER_IS_BETTER = ("length", "solved_length", "distance")
 DIGITS = 9  # rounding errors of sums of thousands of shares are far smaller, intended differences far larger
 ROUNDING = 10.0**-DIGITS
-TAILS = (0.025, 0.975)  # of a 95 % interval
+TAILS = (0.025, 0.975)  # quantiles of a 95 % interval
 RESAMPLES = 20_000
-SHARES_FROM, MEDIANS_FROM = 3, 6  # values that an interval takes: ``studies/coverage.py`` simulates how often it holds
+SHARES_FROM, MEDIANS_FROM = 3, 6  # least values of an interval; ``studies/coverage.py`` simulates how often it holds
 
 
 def tables_of(
@@ -25,7 +25,7 @@ def tables_of(
     by: Sequence[str],
     paired: Sequence[str] = (),
 ) -> dict[str, DataFrame]:
-    """What a question's template is given of :func:`per_run`: ``table``, and ``compared``; nothing without runs."""
+    """Return ``table`` and ``compared`` for a question, of :func:`table.per_run`. Without runs, return nothing."""
     if runs.empty:
         return {}
     return {
@@ -35,7 +35,7 @@ def tables_of(
 
 
 def over(runs: DataFrame, by: Sequence[str]) -> DataFrame:
-    """A row of statistics for each combination of ``by`` and each quantity of :func:`table.per_run`.
+    """Return a row of statistics for each combination of ``by`` and each quantity of :func:`table.per_run`.
 
     The values are layouts, each by the mean of its runs or, with one layout, the runs. Columns: ``by``, ``quantity``,
     mean, standard_error and standard_deviation (n - 1); estimate, the mean of shares and the median of all else, and
@@ -50,7 +50,7 @@ def over(runs: DataFrame, by: Sequence[str]) -> DataFrame:
 
 
 def statistics(runs: DataFrame) -> dict[str, Any]:
-    """See :func:`over`: of runs that are alike."""
+    """Return the statistics of runs that are alike, see :func:`over`."""
     values = runs["value"]
     if runs["layout"].nunique() > 1:
         values = values.groupby(runs["layout"], sort=False).mean()
@@ -69,52 +69,56 @@ def statistics(runs: DataFrame) -> dict[str, Any]:
 
 
 def interval(values: Doubles, *, are_shares: bool) -> tuple[float, float]:
-    """A 95 % interval of (n,) independent values; NaN where there are too few.
+    """Return a 95 % interval of (n,) independent values, or NaN if there are too few.
 
-    Of shares, from ``SHARES_FROM`` on, that of :func:`bounded`; of all else, from ``MEDIANS_FROM`` on, that of
-    :func:`median_bounds`.
+    Shares, at least ``SHARES_FROM``, have the interval of :func:`bounded`. All else, at least ``MEDIANS_FROM`` values,
+    has that of :func:`median_bounds`.
     """
     least, bounds = (SHARES_FROM, bounded) if are_shares else (MEDIANS_FROM, median_bounds)
     return bounds(values) if len(values) >= least else (math.nan, math.nan)
 
 
 def bounded(values: Doubles, least: float = 0.0) -> tuple[float, float]:
-    """Bound the mean of (n,) values between ``least`` and 1: Gaffke's 95 % interval (2005).
+    """Return bounds of the mean of (n,) values between ``least`` and 1: Gaffke's 95 % interval (2005).
 
-    Each value, and a bound that was not seen, weighs as much as the gaps between n even numbers say: the lower end has
-    ``least`` as the unseen one, the upper end 1. Of zeros and ones it is Clopper and Pearson's interval.
+    Each value is weighted by one of the gaps that n random numbers leave within 0 and 1. The remaining gap is the
+    weight of a value that was not seen, which is ``least`` for the lower end and 1 for the upper end. Of zeros and
+    ones, the interval is Clopper and Pearson's.
     """
     weights = gaps(len(values))
     weighed = weights[:, 1:] @ np.sort(values)
     low = np.quantile(weighed + weights[:, 0] * least, TAILS[0])
     high = np.quantile(weighed + weights[:, 0], TAILS[1])
-    return float(low), min(float(high), 1.0)  # up to rounding
+    return float(low), min(float(high), 1.0)  # rounding may exceed 1
 
 
 @cache
 def gaps(count: int) -> Doubles:
-    """The gaps that so many even numbers leave within 0 and 1, drawn again and again: (RESAMPLES, count + 1)."""
+    """Return the gaps that ``count`` uniform numbers leave within 0 and 1, drawn again and again.
+
+    The result is float64 (RESAMPLES, count + 1).
+    """
     return np.random.default_rng(0).dirichlet(np.ones(count + 1), RESAMPLES)
 
 
 def median_bounds(values: Doubles) -> tuple[float, float]:
-    """Bound the median of (n,) values: the widest pair of them outside of which few enough are expected.
+    """Return bounds of the median of (n,) values: two of the values, so far apart that the median is rarely outside.
 
-    At n = 10 these are the second and the ninth, since at most one of ten lies below the median in 1 % of cases.
-    Without ties it excludes 0 where the sign test does (p < .05).
+    At n = 10 these are the second and the ninth value, since at most one of ten lies below the median in 1 % of cases.
+    Without ties the interval excludes 0 if and only if the sign test does (p < .05).
     """
     count = len(values)
     ordered = np.sort(values)
-    below = bdtr(np.arange(count), count, 0.5)  # how often at most so many lie below the median
+    below = bdtr(np.arange(count), count, 0.5)  # P(at most k of ``count`` values lie below the median), by k
     outside = int((below < TAILS[0]).sum())
     return float(ordered[outside - 1]), float(ordered[-outside])
 
 
 def pairs(runs: DataFrame) -> DataFrame:
-    """The first method against each other by each quantity, at each N, over runs that share ``SHARED``.
+    """Return the first method against each other by each quantity, at each N, over runs that share ``SHARED``.
 
-    Pairs that share layout, data and first weights tell more than two means: these may differ by one run. Columns: N,
-    quantity, first, second, and those of :func:`compare`.
+    Pairs that share layout, data and first weights tell more than two means, which may differ because of one run.
+    Columns: N, quantity, first, second, and those of :func:`compare`.
     """
     rows = []
     for (groups, quantity), cell in runs.groupby(["N", "quantity"], dropna=False, sort=False):
@@ -135,21 +139,21 @@ def paired(
     second: DataFrame,
     on: Sequence[str],
 ) -> DataFrame:
-    """A row for each two runs that agree in ``on``; the second's columns end with ``_second``."""
+    """Return a row for each two runs that agree in ``on``. The second run's columns end with ``_second``."""
     return first.merge(second, on=list(on), suffixes=("", "_second"))
 
 
 def compare(both: DataFrame, unit: str = "layout") -> dict[str, Any]:
-    """The first of two methods against the second over n pairs of runs, see :func:`paired`.
+    """Compare the first of two methods with the second over n pairs of runs, see :func:`paired`.
 
-    Pairs of one unit (a column: the layout, or the seed where there is one layout) are not independent: everything but
-    the counts is over units, each of which counts once, by its mean. A tie counts half of an improvement.
+    Pairs of one unit (a column: the layout, or the seed where there is one layout) are not independent. So everything
+    but the counts is over units, each of which counts once, by its mean. A tie counts half of an improvement.
 
     Returns:
         first and second, their names and mean_first and mean_second; n, units (how many), unit (of what), wins, ties,
         probability (of improvement) with probability_low and _high, difference (median of first - second) with
         difference_low and _high (95 %) and _least and _most (of all units), sign_test (two-sided p, ties left out),
-        and higher, whether that is better. Intervals are NaN for too few units, see :func:`interval`.
+        and higher, whether higher values are better. Intervals are NaN for too few units, see :func:`interval`.
     """
     unit = unit if both[unit].nunique() > 1 else "seed"
     higher = both["of"].iloc[0] not in LOWER_IS_BETTER
@@ -189,16 +193,16 @@ def compare(both: DataFrame, unit: str = "layout") -> dict[str, Any]:
 
 
 def sign_test(won: int, lost: int) -> float:
-    """The two-sided p of so uneven a count where neither is better; NaN without any."""
+    """Return the two-sided p of a count at least as uneven if neither is better, or NaN if both counts are 0."""
     decided = won + lost
     return min(1.0, 2 * bdtr(min(won, lost), decided, 0.5)) if decided else math.nan
 
 
 def at_least(values: Any, bound: Any) -> Any:
-    """Whether values (...) are at least ``bound`` (...), up to rounding, as .3 - .1 is .2: bool (...)."""
+    """Return whether values (...) are at least ``bound`` (...), up to rounding, as .3 - .1 is .2: bool (...)."""
     return values >= bound - ROUNDING
 
 
 def above(values: Any, bound: Any) -> Any:
-    """Whether values (...) exceed ``bound`` (...) by more than rounding: bool (...)."""
+    """Return whether values (...) exceed ``bound`` (...) by more than rounding: bool (...)."""
     return values > bound + ROUNDING

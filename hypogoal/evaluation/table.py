@@ -1,4 +1,4 @@
-"""The one table of results: its columns, how numbers become its rows, and each run's final values."""
+"""The one table of results: its columns, how numbers become rows, and each run's final values."""
 
 import tomllib
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from hypogoal.core.config import Values
 from hypogoal.core.files import reading
 
 EVALUATE_AGAIN = "Evaluate the run again, with --force."
-TYPES = {  # of the table's columns; a text is empty, an Int64 missing where it does not apply
+TYPES = {  # of the table's columns; if a column does not apply, a text is empty, and an Int64 missing
     "quantity": "str",
     "value": "float",
     "method": "str",
@@ -30,8 +30,8 @@ TYPES = {  # of the table's columns; a text is empty, an Int64 missing where it 
 }
 TEXTS = [name for name, kind in TYPES.items() if kind == "str"]
 NUMBERS = [name for name, kind in TYPES.items() if kind != "str"]
-SHARED = ["layout", "ladder", "sub_goal", "seed"]  # of two runs that are a pair
-RUN = ["method", "artefact", "N", *SHARED]  # tells one run's numbers from another's
+SHARED = ["layout", "ladder", "sub_goal", "seed"]  # columns in which the two runs of a pair agree
+RUN = ["method", "artefact", "N", *SHARED]  # columns that tell the numbers of runs apart
 MEMBERS = {
     "best": "max",
     "mean": "mean",
@@ -41,13 +41,13 @@ MEMBERS = {
 
 @cache
 def shares() -> set[str]:
-    """The quantities that lie within 0 and 1."""
+    """Return the quantities that lie within 0 and 1."""
     text = Path(__file__).with_name("quantities.toml").read_text(encoding="utf-8")
     return {name for name, (unit, _) in tomllib.loads(text).items() if unit == "fraction"}
 
 
 def tidy(numbers: Any, **place: Any) -> DataFrame:
-    """A row for each number by its name, all of one place (columns of the table)."""
+    """Return a row for each number by its name. All have the place given (columns of the table)."""
     rows = DataFrame(numbers.items(), columns=["quantity", "value"])
     return rows.assign(**place)
 
@@ -57,7 +57,7 @@ def melted(
     index: Any = None,
     **place: Any,
 ) -> DataFrame:
-    """A row for each value of each column, by the names of its ``index``; without any it is of each of K members."""
+    """Return a row for each value of each column, by the names of ``index``. By default, the index is K members."""
     table = DataFrame(columns)
     if index is not None:
         table = table.set_axis(index)
@@ -68,18 +68,18 @@ def melted(
 
 
 def options_of(config: Values) -> pd.MultiIndex:
-    """The sub-goal and the member of each option of an artefact's ``config``, in order: an index of (G*K,) rows."""
+    """Return the sub-goal and the member of each option of an artefact's ``config``, in order: index (G*K,)."""
     goals, members = config["sub_goals"], range(config["members"])
     return pd.MultiIndex.from_product([goals, members], names=["sub_goal", "member"])
 
 
 def joined(parts: Iterable[DataFrame]) -> DataFrame:
-    """The table of rows of several parts; a number that is not defined has no row."""
+    """Return the table of the rows of several parts. A number that is not defined has no row."""
     return typed(pd.concat([DataFrame(columns=[*TYPES]), *parts]))
 
 
 def typed(rows: DataFrame) -> DataFrame:
-    """The same rows, with the columns and types that all others here expect."""
+    """Return rows with all columns of the table and their types, without values that are not finite."""
     rows = rows.reindex(columns=[*TYPES]).astype(object)
     rows[TEXTS] = rows[TEXTS].fillna("")
     rows = rows.astype(TYPES)
@@ -87,7 +87,10 @@ def typed(rows: DataFrame) -> DataFrame:
 
 
 def read_numbers(path: Path) -> DataFrame:
-    """``numbers.csv`` of this version, or of one with other columns; a ``UserError`` where it is missing or damaged."""
+    """Return the table in ``numbers.csv``, whose columns may be those of another version.
+
+    Raises ``UserError`` if the file is missing or damaged.
+    """
     nothing = dict.fromkeys(NUMBERS, "")
     with reading(path, EVALUATE_AGAIN, "the table of numbers"):
         rows = pd.read_csv(path, keep_default_na=False, na_values=nothing)
@@ -101,10 +104,11 @@ def per_run(
     member: str = "mean",
     name: str = "{}",
 ) -> DataFrame:
-    """Quantities' final values in each run: columns ``RUN``, ``value``, ``quantity`` as tables call it, ``of`` which.
+    """Return the final values of quantities in each run: columns ``RUN``, ``value``, ``quantity`` and ``of``.
 
-    ``member``: which of a run's members, ``best`` (the highest), ``mean`` or ``worst``, or the quantity whose value is
-    the member's number, such as ``validated_member``. ``name``: what ``{}``, the quantity, is called.
+    ``member`` says which of a run's members counts: ``best`` (the highest), ``mean`` or ``worst``, or the quantity
+    whose value is the member's number, such as ``validated_member``. ``of`` is the quantity in the table of numbers,
+    and ``quantity`` is ``name`` with the quantity in place of ``{}``.
     """
     final = numbers[numbers["step"].isna()]
     rows = final[final["quantity"].isin(quantities) & (final["scope"] == scope)]

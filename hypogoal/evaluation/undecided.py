@@ -1,6 +1,6 @@
-"""Where rewards have not told which member of a sub-goal to take, and which states' labels would.
+"""Sub-goals of which rewards have not told which member is best, and the states whose labels would tell.
 
-Of agents that count (``chooser=symbols``), whose posterior says how sure they are.
+Only agents with ``chooser=symbols`` are looked at, because their posterior says how sure they are.
 """
 
 from typing import Any
@@ -17,15 +17,16 @@ from hypogoal.evaluation.names import UNIFORM
 from hypogoal.evaluation.verdict import UNDECIDED, outcome_of
 from hypogoal.options.tables import Episodes
 
-EPISODES = 50  # before which nobody can be sure
-DRAWS = 400  # of the posterior
+EPISODES = 50  # with fewer episodes, nobody can be sure
+DRAWS = 400  # draws of the posterior
 NAMED = 8  # states to label
 
 
 def facts(work: Work, numbers: pd.DataFrame) -> dict[str, Any]:
-    """``undecided``: of each agent that still fails the sub-goals whose two best members it cannot tell apart.
+    """Return ``undecided``: failing agents' sub-goals whose two best members the agent cannot tell apart.
 
-    It fails if it solves less than 95 % of the episodes that it plays after training; if it played none, of the last.
+    An agent fails if it solves less than 95 % of the episodes that it plays after training. If it played none, its last
+    ``SHORT`` training episodes count.
     """
     undecided = []
     played = numbers[(numbers["scope"] == FROZEN) & (numbers["quantity"] == "success") & (numbers["method"] != UNIFORM)]
@@ -45,10 +46,11 @@ def facts(work: Work, numbers: pd.DataFrame) -> dict[str, Any]:
 
 
 def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
-    """Each sub-goal's two best members that differ, or do not, by an interval that leaves it open.
+    """Return an entry for each sub-goal whose two best members may or may not differ.
 
-    Members are compared where their sub-goal was pursued most: by their options' values in these symbols, whose
-    difference has a 95 % interval over draws of the posterior.
+    Members are compared by their options' values in the symbols in which their sub-goal was pursued most. The
+    difference has a 95 % interval over draws of the posterior; an entry is made if the interval leaves the outcome
+    open.
     """
     from hypogoal.core.tensors import load_tensors
     from hypogoal.meta.symbols import Model
@@ -83,9 +85,9 @@ def of_agent(work: Work, artefact: Artefact) -> list[dict[str, Any]]:
 
 
 def to_label(work: Work, artefact: Artefact, sub_goal: str, pair: list[int]) -> dict[str, Any]:
-    """``data``, the ensemble's file, and ``states``: the unlabelled ones of it on which two members differ most.
+    """Return the ensemble's file ``data``, and ``states``: its unlabelled states on which two members differ most.
 
-    There are none if the ensemble is not part of the run, or its file has no unlabelled states.
+    ``states`` is empty if the ensemble is not part of the run, or if its file has no unlabelled states.
     """
     from hypogoal.data import open_dataset
     from hypogoal.hypotheses.ensemble import read_ensemble

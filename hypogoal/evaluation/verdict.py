@@ -1,8 +1,8 @@
 """The first thing on a page: what the task is, and whether hypotheses mattered there, by one rule.
 
-Two comparisons say so: the agent with uniform-random choice among its own options (did choosing matter?), and an agent
-with several members with one that has a single classifier (did hypotheses matter?). On ladders the second is of the
-options that validation picks.
+Two comparisons say so. Did choosing matter? The agent is compared with uniform-random choice among its own options. Did
+hypotheses matter? An agent with several members is compared with an agent that has a single classifier. On ladders, the
+second comparison is of the options that validation picks.
 """
 
 import math
@@ -20,13 +20,16 @@ from hypogoal.evaluation.statistics import MEDIANS_FROM, compare, paired
 from hypogoal.evaluation.table import per_run
 from hypogoal.evaluation.zero_shot import SCOPE as OTHER_LAYOUTS
 
-MARGIN = 0.1  # a smaller difference between two shares of solved episodes is none
+MARGIN = 0.1  # a smaller difference between two shares of solved episodes counts as no difference
 BETTER, WORSE, ALIKE, UNDECIDED = "better", "worse", "alike", "undecided"
 CHOOSING, HYPOTHESES, OPTIONS = "choosing", "hypotheses", "options"  # what a finding is about
 
 
 def facts(work):
-    """The tasks of a run, in their domains' words, each agent's, and the cap of episodes, times the shortest path."""
+    """Return the tasks of a run in their domains' words, the task of each agent, and the cap of episodes.
+
+    The cap is in multiples of the shortest path.
+    """
     task_of, tasks, caps = {}, [], []
     for artefact in (*work.contents.agents, *work.contents.ladders):
         config = artefact.config
@@ -42,9 +45,10 @@ def facts(work):
 
 
 def outcome_of(low: float, high: float) -> str:
-    """What the interval of a difference of shares says; of too few units for one, the range of their differences.
+    """Return what the interval of a difference of shares says.
 
-    Within ``MARGIN`` of 0 it is no difference, above or below 0 it is a difference, any other is undecided.
+    If there are too few units for an interval, it is the range of their differences. An interval within ``MARGIN`` of 0
+    is no difference, an interval above or below 0 is a difference, and any other is undecided.
     """
     if max(abs(low), abs(high)) < MARGIN:
         return ALIKE
@@ -54,9 +58,9 @@ def outcome_of(low: float, high: float) -> str:
 
 
 def finding(subject: str, first: pd.DataFrame, second: pd.DataFrame, on: list[str]) -> list[dict[str, Any]]:
-    """Two shares, of runs that agree in ``on``; each layout or ladder counts once, or each run of one.
+    """Return a comparison of two shares, over runs that agree in ``on``, or nothing if there are no pairs.
 
-    Nothing without pairs.
+    Each layout or ladder counts once. If there is only one layout or ladder, each run counts once.
     """
     both = paired(first, second.drop_duplicates(on), on)
     if both.empty:
@@ -69,7 +73,7 @@ def finding(subject: str, first: pd.DataFrame, second: pd.DataFrame, on: list[st
 
 
 def findings(results: Results) -> list[dict[str, Any]]:
-    """Of every agent that chooses among several members, and of options on ladders, what the comparisons say."""
+    """Return what the comparisons say of every agent that chooses among several members, and of options on ladders."""
     success = results.of(quantity="success", sub_goal="")
     trained, played = per_run(success, "success"), success[success["scope"] == FROZEN]
     if played.empty:
@@ -84,7 +88,7 @@ def findings(results: Results) -> list[dict[str, Any]]:
         training, frozen = _of(name, trained), _of(name, played)
         of_choosing = finding(CHOOSING, frozen, _of(UNIFORM, played), ["artefact", "layout"])
         of_choosing = [each | among_members(name, results) for each in of_choosing]
-        # random choice while learning has other options
+        # last, because random choice while learning has other options
         of_choosing = of_choosing or finding(CHOOSING, training, random, ["layout", "seed"])
         result += [each | how_soon(name, results) for each in of_choosing]
         for other, single in learned.items():
@@ -98,7 +102,10 @@ def findings(results: Results) -> list[dict[str, Any]]:
 
 
 def among_members(agent: str, results: Results) -> dict[str, float]:
-    """How often an agent takes the better of two members of a sub-goal, and uniform-random choice; NaN if unknown."""
+    """Return how often an agent, and uniform-random choice, takes the better of two members of a sub-goal.
+
+    The values are NaN if this is unknown.
+    """
     taken = per_run(results.of(quantity="pair"), "pair", scope=FROZEN)
     agents, random = _of(agent, taken), _of(UNIFORM, taken)
     random = random[random["artefact"].isin(agents["artefact"])]
@@ -106,9 +113,10 @@ def among_members(agent: str, results: Results) -> dict[str, float]:
 
 
 def how_soon(agent: str, results: Results) -> dict[str, float]:
-    """After how many episodes 95 % of the last ones were solved: the median of the runs that got there, their share.
+    """Return after how many ``episodes`` 95 % of recent episodes were solved, and the share of runs that ``got_there``.
 
-    ``trained``: the median of how many a training had.
+    ``episodes`` is the median of the runs that got there. ``trained`` is the median number of a run's training
+    episodes.
     """
     own = results.of(method=agent)
     soon, trained, every = (per_run(own, name)["value"] for name in ("episodes_to_95", "episodes", "success"))
@@ -120,7 +128,10 @@ def _of(method, numbers):
 
 
 def _of_ladders(results):
-    """How often options stop at the base: the one of the member that validation picks, else the first."""
+    """Yield findings on how often options stop at the base.
+
+    The options are those of the member that validation picks or, if there is none, of the first member.
+    """
     numbers = results.numbers[results.numbers["ladder"] != ""]
     picked = per_run(numbers, "reached_base", member=VALIDATED)
     first = per_run(numbers[numbers["member"] == 0], "reached_base")
@@ -131,7 +142,7 @@ def _of_ladders(results):
 
 
 def context(results):
-    """For the template: findings, and what agents solved."""
+    """Return what the template needs: findings, and what agents solved."""
     agents = results.facts["agents"]
     final = per_run(results.of(method=[*agents]), "success")
     return {

@@ -1,6 +1,6 @@
-"""Trained agents, and each of their options alone, on layouts that they are given: nothing is learned there.
+"""Play of trained agents, and of each of their options alone, on given layouts, where nothing is learned.
 
-What limits an agent, its options tell: they stop at a false positive of their member, or get nowhere in time.
+An agent's options tell what limits it: they stop at a false positive of their member, or get nowhere in time.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hypogoal.evaluation.table import options_of, per_run
 if TYPE_CHECKING:
     from hypogoal.options.loop import OptionLoop
 
-EPISODES = 3  # of an agent on each layout
-AT_ONCE = 100  # layouts
+EPISODES = 3  # episodes of an agent on each layout
+AT_ONCE = 100  # layouts that are played at once
 PATIENCE = 10  # timeouts after which an option alone is given up
 QUANTITIES = ("success", "near", "within_2", "length", "false_positives")
 TITLE = "On other layouts, without learning"
@@ -34,8 +34,11 @@ Played = dict[str, Doubles]  # a number of each layout (L,)
 
 
 def shortest_ways(engine: Engine) -> Doubles:
-    """Steps from each environment's state to each true sub-goal and, last, to success: (E, G + 1); NaN if not known."""
-    # with PyTorch, which a report needs not
+    """Return the steps from each environment's state to each true sub-goal and, last, to success: (E, G + 1).
+
+    Steps that are not known are NaN.
+    """
+    # with PyTorch, which a report does not need
     from hypogoal.options.planned import FAR, distances, places_of
 
     plan = engine.plan()
@@ -55,10 +58,11 @@ def alone(
     goal: int,
     shortest: Doubles,
 ) -> Played:
-    """Numbers of an option, begun where episodes begin and anew at each timeout until its member is positive.
+    """Return numbers of an option that runs alone until its member is positive.
 
-    It succeeds where its true sub-goal, number ``goal`` of the engine's labels, holds then; NaN where that holds from
-    the beginning.
+    The option begins where episodes begin, and begins anew at each timeout. It succeeds if its true sub-goal, number
+    ``goal`` of the engine's labels, holds where it ends. The numbers are NaN where that sub-goal holds from the
+    beginning.
     """
     from hypogoal.evaluation.frozen import Always
 
@@ -83,7 +87,10 @@ def alone(
 
 
 def played(artefact: Artefact, layouts: tuple[int, ...]) -> Iterator[tuple[dict[str, Any], Played]]:
-    """What an agent does, random choice among its options, and each option alone; each with the fields of its rows."""
+    """Yield the numbers of an agent, of random choice among its options, and of each option alone.
+
+    Each comes after the fields of its rows.
+    """
     from hypogoal.evaluation.frozen import play_both
     from hypogoal.meta.episodes import agent_of
 
@@ -99,7 +106,7 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> Iterator[tuple[dict[
             yield fields, {name: values.mean(axis=1) for name, values in numbers.items()}
     loop.config = loop.config.model_copy(update={"mask_reached": False})
     for option, (sub_goal, member) in enumerate(options_of(config)):
-        if sub_goal in in_domain:  # else the user's own labels said it: its truth here is not known
+        if sub_goal in in_domain:  # if the user's own labels define the sub-goal, its truth is not known
             goal = in_domain.index(sub_goal)
             fields = {
                 "sub_goal": sub_goal,
@@ -109,7 +116,7 @@ def played(artefact: Artefact, layouts: tuple[int, ...]) -> Iterator[tuple[dict[
 
 
 def rows(work):
-    """Every agent, uniform-random choice among its options, and each option on every layout; none without layouts."""
+    """Yield the numbers of every agent, of random choice among its options, and of each option, on each layout."""
     for artefact in work.contents.agents:
         for first in range(0, len(work.layouts), AT_ONCE):
             layouts = work.layouts[first : first + AT_ONCE]
@@ -132,7 +139,7 @@ def rows(work):
 
 
 def context(results):
-    """Agents, uniform-random choice among their options, each option alone, and the mean member."""
+    """Return tables of agents, of random choice among their options, of each option alone, and of the mean member."""
     numbers = results.of(scope=SCOPE)
     values = [per_run(numbers, *QUANTITIES, scope=SCOPE)]
     for member, of_member in numbers.groupby("member"):

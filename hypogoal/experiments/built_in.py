@@ -1,7 +1,7 @@
 """The experiments that come with hypogoal: the paper's figures, and whether an ensemble, and choosing, are needed.
 
-``hypogoal run NAME --out runs/NAME``; ``EXPERIMENTS`` has the names. The evaluation's 'What choosing is worth' compares
-each agent with uniform-random choice among its own options.
+``hypogoal run NAME --out runs/NAME`` runs an experiment; ``EXPERIMENTS`` has the names. The evaluation's 'What choosing
+is worth' compares each agent with uniform-random choice among its own options.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,8 +33,8 @@ CHOOSING = {
     "none": "--diversity none --members 6",
     "one": "--diversity none --members 1",
 }
-SOLVABLE = (70100, 70101, 70102, 70103, 70105, 70107, 70109, 70110, 70111, 70112)  # without a wrong key
-IN_ROOMS = {  # one member more than features, and two for joint
+SOLVABLE = (70100, 70101, 70102, 70103, 70105, 70107, 70109, 70110, 70111, 70112)  # can be solved without a wrong key
+IN_ROOMS = {  # one member more than there are features; joint has two
     "dbat": "--diversity dbat --members 3",
     "divdis": "--diversity divdis --members 3",
     "none": "--diversity none --members 3",
@@ -56,10 +56,10 @@ def doorkey(
 ) -> Iterator[Command]:
     """Figure 6: agents on layouts of three-key DoorKey, with their controls and baselines.
 
-    The ensembles of all seeds, then all of a layout and seed: options, agent, controls, baselines.
+    First come the ensembles of all seeds, then for each layout and seed its options, agent, controls and baselines.
     """
     agents = agents_of(layout_seeds, seeds)
-    is_one = len(agents) == 1  # then names are short: runs/demo/ensemble
+    is_one = len(agents) == 1  # if so, names are short: runs/demo/ensemble
     # What is compared with the agent plays as many steps as its options and it together.
     steps = stage("train-meta").steps + (stage("train-options").steps if pretrain else 0)
     yield Command("data", "collect doorkey")
@@ -78,12 +78,12 @@ def doorkey(
             commands[baseline] = f"train-baseline doorkey --data @data {BASELINES[baseline]} --set steps={steps}"
         for agent, words in commands.items():
             columns: Columns = {"agent": agent, "seed": seed, "layout_seed": layout}
-            # An ensemble uses all cores, and has them first; the others wait for it anyway.
+            # An ensemble uses all cores, and gets them first. Baselines wait; other agents need the ensemble anyway.
             after = [ensembles[seed]] if agent in baselines else []
             yield Command(f"{agent}{at}", f"{words} --seed {seed} --layout-seed {layout}", columns, after)
 
 
-figure6 = replace(doorkey, preset="figure6")  # at a laptop's size
+figure6 = replace(doorkey, preset="figure6")  # of a size for a laptop
 
 
 @experiment("montezuma")
@@ -97,7 +97,7 @@ def montezuma_ladders(
 ) -> Iterator[Command]:
     """Figures 3, 4 and 5: sub-goals and options on the ladders of Montezuma's Revenge.
 
-    The states and ensembles of each N, then the options of each ladder and seed with their oracle.
+    First come the states and ensembles of each N, then for each ladder and seed its options and their oracle.
     """
     for count in groups:
         yield Command(f"data/groups-{count}", f"collect montezuma --set groups={count}", {"groups": count})
@@ -111,13 +111,13 @@ def montezuma_ladders(
             words = f"train-options {ensemble} --set start={ladder} --seed {seed}"
             place = f"options/{method}/groups-{count}-ladder-{ladder}-seed-{seed}"
             yield Command(place, words, {"method": method, "groups": count, "ladder": ladder, "seed": seed})
-        if option_groups and methods:  # any ensemble will do: what these options end at is not learned
+        if option_groups and methods:  # any ensemble will do, because these options end at the truth
             place = f"options/oracle/ladder-{ladder}-seed-{seed}"
             words = f"{words} --set termination=oracle"
             yield Command(place, words, {"method": "oracle", "ladder": ladder, "seed": seed})
 
 
-# At a laptop's size; the first without options.
+# Both have a size for a laptop; figure3 has no options.
 figure3 = replace(montezuma_ladders, preset="figure3", given={"ladders": ""})
 figure4 = replace(montezuma_ladders, preset="figure4")
 
@@ -129,11 +129,11 @@ def choosing(
     seeds: Integers = setting(tuple(range(920, 930)), SEEDS, low=0),
     methods: Names = setting(tuple(CHOOSING), "ensembles", choices=CHOOSING),
 ) -> Iterator[Command]:
-    """Does choosing decide? Options learned in the plain world, chosen in one where a wrong key ends the episode.
+    """Does choosing decide? Options are learned in the plain world, and chosen where a wrong key ends the episode.
 
     The preset has the worlds. Planned options beside the learned ones say what the hypotheses are worth, whatever
-    learning makes of them. The ensembles of all seeds, then of each agent the one of planned options, learned options,
-    the one of these.
+    learning makes of them. First come the ensembles of all seeds, then for each agent the agent with planned options,
+    the learned options, and the agent with learned options.
     """
     yield Command("data", "collect doorkey", {"group": "data"})
     for seed, method in product(seeds, methods):
@@ -162,9 +162,9 @@ def rooms(
     methods: Names = setting(("dbat", "none", "one"), "ensembles", choices=IN_ROOMS),
     truths: Names = setting(("shape", "place"), "what the reward asks for", choices=("shape", "place")),
 ) -> Iterator[Command]:
-    """Is an ensemble needed? In rooms labels cannot tell shape from place, the reward asks for one of them.
+    """Is an ensemble needed? In rooms, labels cannot tell shape from place, and the reward asks for one of the two.
 
-    The states of each seed, its ensembles, then an agent for each of them and each truth.
+    For each seed there are states and ensembles, then an agent for each ensemble and each truth.
     """
     for seed in seeds:
         yield Command(f"data/seed-{seed}", f"collect rooms --seed {seed}", {"group": "data", "seed": seed})

@@ -1,6 +1,6 @@
-"""Experiments, by name: one that comes with hypogoal, a TOML file, a function of one's own.
+"""Experiments by name: one that comes with hypogoal, a TOML file, or a user's own function.
 
-They are generators of (name, command) whose keyword arguments are settings.
+An experiment is a generator of (name, command). Its keyword arguments are settings.
 
 ::
 
@@ -10,7 +10,7 @@ They are generators of (name, command) whose keyword arguments are settings.
         for seed in seeds:
             yield f"ensemble/seed-{seed}", f"train-ensemble @data --seed {seed}", {"seed": seed}
 
-A command is what one would type, without ``--out``; ``@data`` stands for the output of the command of that name.
+A command is what one would type, without ``--out``. ``@data`` stands for the output of the command named ``data``.
 """
 
 import inspect
@@ -32,7 +32,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.domains.base import load_domain
 
-STAGE = "stage"  # an argument that is no setting: gives a stage's settings, as in stage("train-meta").steps
+STAGE = "stage"  # an argument that gives a stage's settings, as in stage("train-meta").steps, and is none itself
 LAYOUTS = "layouts, each with an agent of its own"
 SEEDS = "run seeds, each with ensembles of its own"
 EXPERIMENTS = {
@@ -46,17 +46,17 @@ EXPERIMENTS = {
 }
 Names = tuple[str, ...]
 Integers = tuple[int, ...]
-Function = Callable[..., Iterable[Any]]  # of settings, by keyword; yields Command or its fields
-Columns = Mapping[str, Value]  # of results.csv: seed, method, ...
+Function = Callable[..., Iterable[Any]]  # takes settings by keyword, and yields Command or its fields
+Columns = Mapping[str, Value]  # columns of results.csv: seed, method, ...
 
 
 class Command(NamedTuple):
     """One command of an experiment."""
 
-    name: str  # its place in the run's folder: ensemble/seed-0
+    name: str  # the output's place in the run's folder, such as ensemble/seed-0
     command: str  # as one would type it
     columns: Mapping[str, Value] = {}
-    after: Sequence[str] = ()  # names of commands that have this machine's cores before it
+    after: Sequence[str] = ()  # names of commands that get this machine's cores first
 
 
 class RunConfig(Config):
@@ -73,13 +73,16 @@ class Experiment:
     function: Function
     arguments: Sequence[str]
     model: type[RunConfig]  # the settings of ``hypogoal run``: those of all experiments, and the function's
-    domain: str | None = None  # whose presets have settings of this experiment
-    preset: str | None = None  # if no other is given
+    domain: str | None = None  # the domain whose presets have settings of this experiment
+    preset: str | None = None  # the preset, unless another is given
     given: Values = field(default_factory=dict)  # settings, unless others are given
 
 
 def experiment(domain: str | None = None, preset: str | None = None) -> Callable[[Function], Experiment]:
-    """Makes a function an experiment on ``domain``, whose presets then may have settings of it."""
+    """Return a decorator that makes a function an experiment.
+
+    The presets of ``domain`` may then have settings of the experiment.
+    """
 
     def decorated(function: Function) -> Experiment:
         hints = get_type_hints(function)
@@ -96,12 +99,15 @@ def experiment(domain: str | None = None, preset: str | None = None) -> Callable
 
 
 def run_config(fields: Mapping[str, Any]) -> type[RunConfig]:
-    """The settings of all experiments and these: (type, default) by name."""
+    """Return a class of the settings of all experiments and of ``fields``, (type, default) by name."""
     return create_model("RunConfig", __base__=RunConfig, __doc__=RunConfig.__doc__, **fields)
 
 
 def agents_of(layouts: Sequence[int], seeds: Sequence[int]) -> list[tuple[int, int]]:
-    """Layouts with seeds: each with the one at its place; a single one goes with all of the others."""
+    """Return pairs of layouts and seeds: each layout with the seed at its place. A single one goes with all others.
+
+    Raises ``UserError`` if they cannot be paired.
+    """
     try:
         pairs = np.broadcast_arrays(layouts, seeds)
     except ValueError:
@@ -111,7 +117,10 @@ def agents_of(layouts: Sequence[int], seeds: Sequence[int]) -> list[tuple[int, i
 
 
 def find_experiment(name: str) -> Experiment:
-    """One of ``EXPERIMENTS``, a TOML file, or ``module:function``; an unknown one is a ``UserError``."""
+    """Return one of ``EXPERIMENTS``, the experiment in a TOML file, or ``module:function``.
+
+    Raises ``UserError`` if there is no such experiment.
+    """
     if name.endswith(".toml"):
         return read_toml(Path(name))
     target = own_code.load(name, "experiment", "hypogoal.experiments", EXPERIMENTS)
@@ -123,7 +132,10 @@ def find_experiment(name: str) -> Experiment:
 
 
 def config_class_of(stage: str, domain: str = DOMAIN) -> Any:
-    """The settings of a stage, by its command's name; of ``run`` those of the domain's experiment, if there is one."""
+    """Return the class of a stage's settings, by the name of its command.
+
+    The class of ``run`` is that of the domain's experiment, if there is one.
+    """
     if stage == "collect":
         return load_domain(domain).config_class
     if stage in MODELS:
@@ -135,14 +147,14 @@ def config_class_of(stage: str, domain: str = DOMAIN) -> Any:
 
 
 class Row(Config):
-    """Of a TOML file: a command for each point of its axes."""
+    """Cells in a TOML file: a command for each point of its axes."""
 
     name: str
     command: str
     axes: tuple[str, ...] = ()
 
     def at(self, point: Mapping[str, Value]) -> str:
-        """The cell's name: NAME, or NAME/AXIS-VALUE-AXIS-VALUE."""
+        """Return the name of the cell at a point: NAME, or NAME/AXIS-VALUE-AXIS-VALUE."""
         values = "-".join(f"{axis}-{point[axis]}" for axis in self.axes)
         return f"{self.name}/{values}" if values else self.name
 
@@ -155,7 +167,10 @@ class File(RunConfig):
     cells: list[Row]
 
     def commands(self, axes: Mapping[str, Sequence[Value]]) -> Iterator[Command]:
-        """In a command ``{AXIS}`` is its value, ``{NAME}`` the output of the cells of that name for the same values."""
+        """Yield the commands. In a command, ``{AXIS}`` stands for the axis's value.
+
+        ``{NAME}`` stands for the output of the cells of that name at these values.
+        """
         for row in self.cells:
             for values in product(*(axes[axis] for axis in row.axes)):
                 point = dict(zip(row.axes, values, strict=True))
@@ -168,7 +183,7 @@ class File(RunConfig):
 
 
 def read_toml(path: Path) -> Experiment:
-    """The experiment in a TOML file; a ``UserError`` where there is none."""
+    """Return the experiment in a TOML file. Raises ``UserError`` if there is none."""
     readable = partial(reading, path, "Mend the file, see docs/formats.md.", "the experiment")
     with readable():
         text = path.read_text(encoding="utf-8-sig")

@@ -1,4 +1,4 @@
-"""From the name of an experiment to its cells."""
+"""How the name of an experiment becomes its cells."""
 
 import re
 import shlex
@@ -17,11 +17,11 @@ from hypogoal.domains.base import settings_of
 from hypogoal.experiments.experiment import STAGE, Command, find_experiment
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 
-OUTPUT = re.compile("(|.*=)@(.+)")  # in a word an output: @data, --data=@data
+OUTPUT = re.compile("(|.*=)@(.+)")  # a word with an output: @data, --data=@data
 MEND = "An experiment yields (name, command) or (name, command, columns), see docs/formats.md."
 
 NAMES = ("diversity", "network", "teacher", "threshold", "view")  # settings that name code
-NEEDED = ("seeds", "layout_seeds", "layouts", "truths")  # without one there would be no agent
+NEEDED = ("seeds", "layout_seeds", "layouts", "truths")  # settings without whose values there would be no agent
 
 
 def plan(
@@ -33,9 +33,10 @@ def plan(
     seeds: str | None = None,
     device: str = "auto",
 ) -> tuple[list[Cell], int]:
-    """The cells of an experiment, and how many run at once (0: as many as can); a ``UserError`` where they cannot be.
+    """Return the cells of an experiment, and how many run at once (0: as many as can).
 
-    ``assignments`` are ``SETTING=VALUES`` of the experiment and ``STAGE.KEY=VALUE``; ``seeds`` the run seeds, ``0-9``.
+    ``assignments`` are ``SETTING=VALUES`` of the experiment and ``STAGE.KEY=VALUE``. ``seeds`` are the run seeds, such
+    as ``0-9``. Raises ``UserError`` if the experiment cannot be planned.
     """
     experiment = find_experiment(name)
     preset = preset or experiment.preset
@@ -63,6 +64,8 @@ def plan(
     stages = dict.fromkeys(cell.stage for cell in cells)
     for stage in of_stage.keys() - stages:
         raise UserError("no such stage in --set", stage, f"This run has {', '.join(stages)}.")
+    if STAGE not in experiment.arguments:
+        _refuse_ignored(cells, of_stage)
     if config.evaluate:
         everything = [cell.place for cell in cells]
         evaluation = Cell(name="evaluation", words=["evaluate", HERE], needs=everything, run=run)
@@ -71,10 +74,20 @@ def plan(
     return cells, config.workers
 
 
+def _refuse_ignored(cells: Iterable[Cell], settings: Mapping[str, Mapping[str, str]]) -> None:
+    """Raise ``UserError`` if no command has a setting, by stage, that the user gave for all commands of its stage."""
+    for stage, shared in settings.items():
+        of_stage = [cell.words for cell in cells if cell.stage == stage]
+        for name, value in shared.items():
+            if not any(f"{name}={value}" in words for words in of_stage):
+                fault = f"each {stage} of this experiment has a value of its own, or another choice"
+                raise UserError(fault, f"{stage}.{name}", f"Leave it out, or give the command {stage} yourself.")
+
+
 def _check_names(config: Config, usual: Config) -> None:
     """Load what settings of ``train-ensemble`` name, so that a wrong name is told before the first cell is made.
 
-    Those of its domain's ``usual`` settings need no look, and no PyTorch.
+    Names in the domain's ``usual`` settings are not loaded, because loading them takes PyTorch.
     """
     if not isinstance(config, TrainEnsembleConfig):
         return
@@ -85,12 +98,12 @@ def _check_names(config: Config, usual: Config) -> None:
 
 
 def _cells_of(commands: Iterable[Any], run: Path, completed: Callable[..., Any]) -> Iterator[Cell]:
-    """A cell for each command, in which ``@NAME`` is the output of the cell of that name before it.
+    """Yield a cell for each command. In a command, ``@NAME`` is the output of an earlier cell of that name.
 
-    ``completed`` gives a command's words with those that it shares, and the domain that it plays.
+    ``completed`` returns a command's words with the run's shared words, and the domain that the command plays.
     """
     cells: dict[str, Cell] = {}
-    domains: dict[str, str] = {}  # by place
+    domains: dict[str, str] = {}  # domains by a cell's place
     for command in commands:
         try:
             name, text, columns, after = Command(*command)
@@ -133,10 +146,10 @@ def _with_shared(
     words: Sequence[str],
     domain: str,
 ) -> tuple[list[str], str]:
-    """A command's words with the preset, device and settings (by stage) of its run, unless they say otherwise.
+    """Return a command's words with the run's preset, device and settings (by stage), and the domain played.
 
-    And the domain played; ``domain`` is that of the states that are read. What the stage does not take is a
-    ``UserError``.
+    What the command says itself is left as it is. ``domain`` is the domain of the states that are read. Raises
+    ``UserError`` if the stage does not take a setting.
     """
     stage, *rest = words
     loaded = load_stage(stage)
@@ -146,7 +159,7 @@ def _with_shared(
     domain = values.get("domain") or domain
     more = []
     if stage in STAGES:
-        allow(words)  # a TOML file's names are allowed already, others are those of code that the user gave
+        allow(words)  # a TOML file's names were allowed before; other names are in code that the user gave
         if preset and not values["preset"]:
             more += ["--preset", preset]
         if device != "auto" and values.get("device") == "auto":

@@ -1,4 +1,4 @@
-"""A run of cells: begun, made anew in part, gone on with, on this machine or by Slurm."""
+"""A run of cells: how it is begun, resumed or partly made anew, on this machine or by Slurm."""
 
 import multiprocessing
 import os
@@ -20,7 +20,7 @@ from hypogoal.core.processes import CORES, cores, surroundings
 from hypogoal.core.progress import duration
 from hypogoal.experiments import slurm
 
-PRELOADED = [  # what stages import when they are called
+PRELOADED = [  # modules that stages import when they are called
     "networkx",
     "h5py",
     "minigrid",
@@ -32,7 +32,7 @@ PRELOADED = [  # what stages import when they are called
 ]
 POLL_SECONDS = 0.05
 CRASHED = (signal.SIGSEGV, signal.SIGABRT)  # torch aborts at a segmentation fault
-CRASHES = 3  # of a cell that are survived: the emulator of Montezuma's Revenge can crash in long runs (its issue 11)
+CRASHES = 3  # a cell may crash so often: the emulator of Montezuma's Revenge can crash in long runs (its issue 11)
 OTHERWISE = "Give the settings it was begun with, --from STAGE to make a stage anew with these, or another --out."
 
 
@@ -50,8 +50,8 @@ def run(
 ) -> None:
     """Run the cells that are not done, on this machine or, with options for ``sbatch``, by Slurm.
 
-    A run that exists is a ``UserError`` unless it is to be resumed, forced (all anew), or made anew ``from_`` a stage
-    or ``only`` in that stage. A cell that is not made is a ``UserError`` at the end.
+    Raises ``UserError`` if the run exists, unless it is to be resumed, forced (all anew), or made anew ``from_`` a
+    stage or ``only`` in that stage. Raises ``UserError`` at the end if a cell is not made.
     """
     chosen = in_part(cells, from_, only)
     if out.exists() and not (force or resume or from_ or only):
@@ -78,7 +78,10 @@ def run(
 
 
 def in_part(cells: Sequence[Cell], from_: str | None, only: str | None) -> list[Cell]:
-    """The cells of the stage ``only`` or, with all that read them, of the stage ``from_``; without one all."""
+    """Return the cells of the stage ``only`` or, with all cells that read these, of the stage ``from_``.
+
+    Without either, return all cells.
+    """
     if not (from_ or only):
         return [*cells]
     places = {cell.place for cell in cells if cell.stage == (from_ or only)}
@@ -86,14 +89,17 @@ def in_part(cells: Sequence[Cell], from_: str | None, only: str | None) -> list[
         stages = dict.fromkeys(cell.stage for cell in cells)
         do = f"Choose one of {', '.join(stages)}."
         raise UserError("--from or --only needs one stage of the run", from_ or only, do)
-    for cell in cells:  # those that a cell needs are before it
+    for cell in cells:  # in order, because a cell comes after those that it needs
         if from_ and not places.isdisjoint(cell.needs):
             places.add(cell.place)
     return [cell for cell in cells if cell.place in places]
 
 
 def begin(cells: Sequence[Cell], run: Path, anew: Sequence[Cell] = ()) -> None:
-    """Write the plan, and remove what cells to be made ``anew`` made. A run that has made others is a ``UserError``."""
+    """Write the plan, and remove what the cells ``anew`` made earlier.
+
+    Raises ``UserError`` if the run was begun with other commands for cells that are kept.
+    """
     words = {cell.name: cell.words for cell in cells}
     renewed = {cell.name for cell in anew}
     for old in read_plan(run):
@@ -107,11 +113,11 @@ def begin(cells: Sequence[Cell], run: Path, anew: Sequence[Cell] = ()) -> None:
         cell.log("code").unlink(missing_ok=True)
     replace_text(run / PLAN, CELLS.dump_json([*cells], indent=1).decode() + "\n")
     if unmade(run):
-        discard([cell for cell in cells if cell.is_derived])  # they are of less than there will be
+        discard([cell for cell in cells if cell.is_derived])  # an old evaluation would be of fewer cells
 
 
 def discard(cells: Sequence[Cell]) -> None:
-    """Remove what cells made or began; one that is being made is a ``UserError``."""
+    """Remove what cells made or began. Raises ``UserError`` if a cell is being made."""
     for cell in cells:
         if cell.draft.is_locked:
             raise UserError("another process makes it", cell.draft.out, "Wait until it is done, or end it.")
@@ -124,12 +130,12 @@ def discard(cells: Sequence[Cell]) -> None:
 
 
 def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None], forked: bool | None = None) -> None:
-    """Run cells that are not done, in their order, until each is done, has failed, or needs one that has.
+    """Run cells that are not done, in their order, until each is done, has failed, or needs a cell that has failed.
 
-    At most ``workers`` (0: one per core) run at once; those that start together share the cores. One that another
-    process is making, left over by a run that was killed, is waited for. One that crashes goes on from its checkpoint,
-    at most ``CRASHES`` times. At the end those that still run get SIGTERM. ``forked``: cells start from one process
-    that has imported what they need; by default on Linux without CUDA.
+    At most ``workers`` cells (0: one per core) run at once, and cells that start together share the cores. If another
+    process, left over by a run that was killed, is making a cell, that cell is waited for. A cell that crashes goes on
+    from its checkpoint, at most ``CRASHES`` times. If the run is stopped, cells that still run get SIGTERM. ``forked``:
+    cells start from one process that has imported what they need; this is the default on Linux without CUDA.
     """
     if forked is None:
         forked = sys.platform == "linux" and not any("cuda" in cell.words for cell in cells)
@@ -138,7 +144,7 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
         context.set_forkserver_preload(PRELOADED)
     todo = [*cells]
     begun_at = time.monotonic()
-    running: dict[Any, Cell] = {}  # by process
+    running: dict[Any, Cell] = {}  # cells by process
     crashes: Counter[str] = Counter()
 
     def end(process: Any) -> Cell:
@@ -166,7 +172,7 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                 time.sleep(POLL_SECONDS)
                 for process in [process for process in running if process.exitcode is not None]:
                     cell = end(process)
-                    if cell.state == RUNNING:  # by a process that is left over
+                    if cell.state == RUNNING:  # a process that is left over makes the cell
                         todo.append(cell)
                     elif cell.state == DONE:
                         say(f"{cell.name} is done")
@@ -184,14 +190,17 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
 
 
 def _to_come(cells: Sequence[Cell], waiting: int, seconds: float) -> str:
-    """How many cells wait, and how long all that is left takes at the pace of what is done after so many seconds."""
+    """Return how many cells wait, and how long all that is left will take.
+
+    The pace is that of the cells that are done after ``seconds``.
+    """
     done = sum(cell.is_done for cell in cells)
     left = f", about {duration(seconds / done * (len(cells) - done))} left" if done else ""
     return f"{waiting} {'command' if waiting == 1 else 'commands'} to come{left}"
 
 
 def _make(words: list[str], log: Path, variables: Mapping[str, str]) -> None:
-    """In a cell's process: the command, as one types it, with this environment; its output goes into its log."""
+    """Run a command in a cell's process, as one types it, with this environment. Its output goes into the log."""
     os.environ.update(variables)
     with log.open("ab") as printed:
         for number in (1, 2):

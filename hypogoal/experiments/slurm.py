@@ -1,8 +1,8 @@
-"""Cells as Slurm job arrays: Slurm decides where and when, what is on the disk says what is done.
+"""Cells as Slurm job arrays: Slurm decides where and when cells run, and the disk says which cells are done.
 
-There is an array for the cells of a stage. It begins when the arrays that it reads have ended, successfully or not
-(``afterany``). Slurm's accounting is not needed. A cell saves before its time limit and is
-queued again; when it is cancelled, it saves too.
+Each stage has an array for its cells. An array begins when the arrays that it reads have ended, successfully or not
+(``afterany``). Slurm's accounting is not needed. Before its time limit, a cell saves and is queued again. A cell that
+is cancelled saves, too.
 """
 
 import os
@@ -20,12 +20,12 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import replace_text
 from hypogoal.core.processes import surroundings
 
-JOBS = "slurm/jobs"  # the jobs last submitted, the last of them first, behind --clusters=NAME: scancel $(cat ...)
+JOBS = "slurm/jobs"  # file with the jobs last submitted, the last first, after --clusters=NAME: scancel $(cat ...)
 COLOURS = re.compile(r"\x1b\[[\d;]*[A-Za-z]")
-# A line of sbatch's that is its answer; clusters have words of their own before and behind it.
+# The line of sbatch's output that is its answer; some clusters print more lines.
 ANSWER = re.compile(r"^[ \t]*(?:Submitted batch job )?(\d+)(?:(?:;| on cluster )(\S+))?[ \t\r]*$", re.MULTILINE)
 
-# A line of the file of cells: a cell's log, its checkpoints, its command. It is stopped two minutes before its limit.
+# A line of the file of cells has a cell's log, checkpoints and command. A cell stops two minutes before its time limit.
 SCRIPT = """#!/bin/sh
 #SBATCH --open-mode=append --requeue --signal=B:USR2@120
 cd {here} || exit 1
@@ -43,7 +43,10 @@ wait "$cell"; code=$?; echo "$code" >"$log.code"; exit "$code"
 
 
 def check_free(run: Path, *, is_wanted: bool) -> None:
-    """Refuse (``UserError``) a run whose jobs wait or run, or may; if Slurm ``is_wanted``, also no Slurm."""
+    """Raise ``UserError`` if jobs of the run wait or run, or if Slurm does not say so.
+
+    If Slurm ``is_wanted``, also raise ``UserError`` if there is no Slurm.
+    """
     if is_wanted and shutil.which("sbatch") is None:
         raise UserError("there is no Slurm here (no sbatch)", "--engine slurm", "Use --engine local.")
     jobs = run / JOBS
@@ -62,17 +65,17 @@ def check_free(run: Path, *, is_wanted: bool) -> None:
 
 
 def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], say: Callable[[str], None]) -> None:
-    """Submit an array for each stage of these cells.
+    """Submit an array for each stage of the cells.
 
-    At most ``cap`` cells of an array run at once; 0 is no limit. ``options`` are of ``sbatch``. Every node must see
-    the run's folder under the same path. A refusal by Slurm is a ``UserError``.
+    At most ``cap`` cells of an array run at once; 0 is no limit. ``options`` are for ``sbatch``. Every node must see
+    the run's folder under the same path. Raises ``UserError`` if Slurm refuses.
     """
     folder = run.resolve() / "slurm"
     folder.mkdir(exist_ok=True)
     output = f"--output={str(folder).replace('%', '%%')}/%x-%A-%a.out"
     here, python = shlex.quote(os.getcwd()), shlex.quote(sys.executable)
-    job_of: dict[str, str] = {}  # by what it makes
-    for name in LISTED:  # a stage reads what those before it made
+    job_of: dict[str, str] = {}  # by a cell's place
+    for name in LISTED:  # in this order, because a stage reads what earlier stages made
         part = [cell for cell in cells if cell.stage == name]
         if not part:
             continue
@@ -106,13 +109,13 @@ def submit(cells: Sequence[Cell], run: Path, cap: int, options: Sequence[str], s
 
 
 def _line(cell: Cell) -> str:
-    """What the batch script needs of a cell."""
+    """Return what the batch script needs of a cell, as a line."""
     log = cell.log().with_suffix("")
     return shlex.join([str(log), str(cell.draft.checkpoint), *cell.command, "--resume"]) + "\n"
 
 
 def _asked(*words: str) -> subprocess.CompletedProcess[str]:
-    """What a command of Slurm's says; jobs inherit its environment."""
+    """Return what a command of Slurm's says. Jobs inherit the environment that the command gets."""
     with surroundings():
         done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
     done.stdout = COLOURS.sub("", done.stdout)

@@ -1,1 +1,1 @@
-"""Import of what users have: arrays, pictures, recorded episodes, tables of labels."""
+"""The import of users' arrays, pictures, recorded episodes and tables of labels."""

@@ -1,4 +1,4 @@
-"""Frames, checked and split into the sets of a data file."""
+"""How frames are checked, and split into the sets of a data file."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +15,9 @@ from hypogoal.data import GROUP, Collected, States, doubts_of, require_classes
 from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNLABELLED, Frames, together
 from hypogoal.observations import digest, packed
 
-ROW = "row"  # the origin of each state: its place in its set
+ROW = "row"  # the origin that says a state's place in its set
 DOUBT = "{} times equal states have both labels of {}: no member can be right about {}"
-SPLIT = np.array([0.4, 0.4, 0.2])  # shares of episodes that are labelled, unlabelled and held out
+SPLIT = np.array([0.4, 0.4, 0.2])  # the shares of episodes that become labelled, unlabelled and held out
 MORE = "Give more, at least three episodes that are labelled; rows and pictures have their sets by name."
 REMARK = "no held-out states were given: {} of the labelled ones are held out, which says nothing about other contexts"
 
@@ -32,10 +32,10 @@ def assemble(
     share: float = 0.2,
     seed: int = 0,
 ) -> tuple[Collected, list[str]]:
-    """The states in the form of a data file, and lines on what is allowed but may surprise.
+    """Return the states in the form of a data file, and lines on what is allowed but may surprise.
 
-    Without held-out states, a ``share`` of each class of the labelled ones, or of their groups, is held out by
-    ``seed``. Unusable states and a class that is missing are a ``UserError``.
+    Without held-out states, a random ``share`` of each class of the labelled states, or of their groups, is held out.
+    Raises ``UserError`` if states are unusable, or if a set or a class has no states.
     """
     kept = frames.table["kept"]
     table = frames.table[kept].reset_index(drop=True)
@@ -78,7 +78,10 @@ def assemble(
 
 
 def contradictions(table: DataFrame, labels: Bools, goals: Sequence[str]) -> list[str]:
-    """A line for each sub-goal of which equal states have both labels; a ``UserError`` if a class has no others."""
+    """Return a line for each sub-goal for which equal states have both labels.
+
+    Raises ``UserError`` if the labelled states without such contradictions lack a class.
+    """
     lines = []
     judged = table[table["role"] != UNLABELLED]
     for goal, column in zip(goals, labels.T, strict=True):
@@ -97,10 +100,10 @@ def contradictions(table: DataFrame, labels: Bools, goals: Sequence[str]) -> lis
 
 
 def with_roles(table: DataFrame, seed: int) -> DataFrame:
-    """What is known of frames, with a role for all: :attr:`Frames.table`.
+    """Return ``table``, as :attr:`Frames.table` describes it, with a role for every frame.
 
-    Whole episodes whose role is open are drawn for those of the three that no frame has yet, ``SPLIT`` of them each,
-    and stand in the order in which they were drawn.
+    Only roles that no frame has yet are given. They are given to whole episodes at random, in the proportions of
+    ``SPLIT``. In the table returned, these episodes stand in the order in which they were drawn.
     """
     is_open = table["role"] == ""
     number_of, episodes = pd.factorize(table["episode"][is_open])
@@ -110,7 +113,7 @@ def with_roles(table: DataFrame, seed: int) -> DataFrame:
     shares = np.cumsum(SPLIT * is_missing)
     whole = shares / shares[2]
     ends = np.round(whole[:2] * len(episodes))
-    # of all recordings, not of Minari's alone: the name stays, since another is another split
+    # The stream's name is for all recordings, not for Minari's alone. With another name, all splits would change.
     order = rng_for(seed, "minari").permutation(len(episodes))
     place = np.argsort(order)[number_of]
     role_of = np.searchsorted(ends, place, side="right")
@@ -125,9 +128,9 @@ def apart(
     share: float,
     seed: int,
 ) -> tuple[DataFrame, list[str]]:
-    """The frames without those that are in two sets, and lines that say so.
+    """Return the frames without those that are in two sets, and lines that say what was done.
 
-    Where no states are held out, nor drawn by episodes, a ``share`` of the labelled ones is.
+    If no state is held out, and no roles were drawn by episode, a ``share`` of the labelled states is held out.
     """
     lines = []
     learned = [LABELLED, UNLABELLED]
@@ -155,10 +158,11 @@ def apart(
 
 
 def held_out(labels: Bools, table: DataFrame, share: float, seed: int) -> Bools:
-    """Which states are held out, bool (N,): whole groups, and without groups all that look alike.
+    """Draw the states that are held out, bool (N,).
 
-    Of each combination of labels (N, G) that groups have, a random ``share``, never all. A remainder of less than one
-    is carried over to the next combination. None at all is a ``UserError``.
+    Whole groups are held out together, and so are states without a group that look alike. For each combination of
+    labels (N, G) that groups have, a random ``share`` of these groups is held out, but never all. A remainder of less
+    than one group is carried over to the next combination. Raises ``UserError`` if no group can be held out.
     """
     in_group = table["group"] != ""
     unit = table["group"].where(in_group, table["look"])

@@ -1,4 +1,4 @@
-"""What labels states: the rules of ``--label`` for episodes, and tables that people fill in."""
+"""How states are labelled, by the rules of ``--label`` for episodes, and by tables that people fill in."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,17 +16,19 @@ from hypogoal.data import Collected, joined, open_dataset, write_dataset
 from hypogoal.importing.states import UNLABELLED, Frames
 from hypogoal.observations import NUMBERS, digest
 
-LAST, TABLE = "last:", ".csv"  # how rules begin and end that are no columns
-SPANS = {"episode": str, "from": int, "to": int}  # columns of a table of positive frames; ``to`` is the first behind
-SUCCESS = ("next.success", "success", "next.reward", "reward", "rewards")  # columns that say so, the first there is
+LAST, TABLE = "last:", ".csv"  # the beginning of a rule for last frames, and the end of a rule that names a table
+SPANS = {"episode": str, "from": int, "to": int}  # the columns of a table of positive frames, without the frame ``to``
+SUCCESS = ("next.success", "success", "next.reward", "reward", "rewards")  # columns of success, in order of preference
 TRUTHS = {"0": False, "1": True}
 
 
 def labels_of(frames: Frames, rules: Mapping[str, str]) -> Bools:
-    """Whether each sub-goal holds in frames, (N, G), by the rule for it.
+    """Return whether each sub-goal holds in each frame, bool (N, G).
 
-    A column above 0; ``last:N`` frames of each success; a table, ``FILE.csv``; or ``module:function`` of what is seen,
-    of several keys a dictionary. Episodes that a table does not list become unlabelled.
+    ``rules`` are, by sub-goal, one of four texts. The name of a column means the frames in which the column is above 0.
+    ``last:N`` means the last N frames of each success. ``FILE.csv`` is a table of positive frames. ``module:function``
+    is asked about each observation, which is a dictionary if there are several keys. Frames of which a rule knows
+    nothing, such as those of episodes that a table does not list, become unlabelled.
     """
     marks = [_marks(frames, rule) for rule in rules.values()]
     labels = np.stack(marks, axis=1)
@@ -36,7 +38,7 @@ def labels_of(frames: Frames, rules: Mapping[str, str]) -> Bools:
 
 
 def _marks(frames: Frames, rule: str) -> Any:
-    """Numbers (N,), above 0 where a sub-goal holds, NaN where that is not known."""
+    """Return numbers (N,) that are above 0 where a sub-goal holds, and NaN where nobody knows whether it holds."""
     if rule.endswith(TABLE):
         return _by_table(frames.table, Path(rule))
     episode = frames.table["episode"]
@@ -48,7 +50,7 @@ def _marks(frames: Frames, rule: str) -> Any:
         for name in SUCCESS:
             if name in columns:
                 numbers = pd.to_numeric(columns[name], errors="coerce").astype(float)
-                return is_last * numbers.groupby(episode).transform("max")  # NaN where it has none
+                return is_last * numbers.groupby(episode).transform("max")  # NaN if the episode has no numbers
         return is_last
     if ":" in rule and rule not in columns:
         return _by_function(frames, rule)
@@ -63,7 +65,7 @@ def _marks(frames: Frames, rule: str) -> Any:
 
 
 def _by_function(frames: Frames, rule: str) -> Array:
-    """1 in the frames of which a function of what is seen says so, NaN in those that are not kept."""
+    """Return marks (N,), 1 in the frames that a function of the observation calls positive, and NaN if not kept."""
     holds = load(rule, "label", "", {})
     marks = np.full(len(frames.table), np.nan)
     by_key = pd.DataFrame(frames.seen).to_dict("records")
@@ -72,7 +74,7 @@ def _by_function(frames: Frames, rule: str) -> Array:
 
 
 def _by_table(table: pd.DataFrame, path: Path) -> Array:
-    """1 in the frames that a table of ``SPANS`` lists, NaN in episodes that it does not."""
+    """Return marks (N,), 1 in the frames that a table of ``SPANS`` lists, and NaN in episodes that it does not list."""
     spans = read_table(path, SPANS)
     marks = np.full(len(table), np.nan)
     is_listed = table["episode"].isin(spans["episode"])
@@ -88,7 +90,7 @@ def _by_table(table: pd.DataFrame, path: Path) -> Array:
 
 
 def read_table(path: Path, columns: dict[str, Any]) -> pd.DataFrame:
-    """The columns of a CSV file, by their types; a byte order mark is left out."""
+    """Read ``columns``, types by name, of a CSV file. A byte order mark is left out."""
     names = ", ".join(columns)
     with reading(path, f"Give a CSV file, with commas, whose first line names {names}."):
         return pd.read_csv(
@@ -101,10 +103,11 @@ def read_table(path: Path, columns: dict[str, Any]) -> pd.DataFrame:
 
 
 def add_labels(source: Path, file: Path, sub_goal: str, path: Path, seed: int) -> list[str]:
-    """Write a data file's states again, those that a table labels among the labelled ones; returns how many these are.
+    """Write the states of the data file ``source`` to ``file``, with labels for the states in the table at ``path``.
 
-    ``audit`` proposes the table beside pictures of the states, a person or a script fills it in. One of other data,
-    that names a state twice, and data of several sub-goals are a ``UserError``.
+    ``audit`` proposes the table beside pictures of the states, and a person or a script fills it in. Returns a line on
+    how many states are labelled. Raises ``UserError`` if the table is of other data or names a state twice, or if the
+    data have several sub-goals.
     """
     dataset = open_dataset(source)
     if dataset.sub_goals != (sub_goal,):

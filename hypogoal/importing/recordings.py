@@ -1,10 +1,10 @@
 """Readers of arrays and of recorded episodes: Minari, robomimic's HDF5, folders of films, and LeRobotDataset.
 
-Arrays are a ``.npz`` file, or a folder of ``.npy`` files with the same names.
+Arrays are in one ``.npz`` file, or in a folder of ``.npy`` files named as the arrays.
 
-A LeRobotDataset, formats v2.1 and v3.0, has tables in parquet, frames in films or in the tables, facts in ``meta/``. In
-v2.1 each episode has files of its own, in v3.0 many episodes share files, and ``meta/episodes/`` says where in a film
-an episode begins. The package lerobot is not needed, pyarrow and PyAV are (``hypogoal[lerobot]``).
+A LeRobotDataset (format v2.1 or v3.0) has tables in parquet, frames in films or in the tables, and facts in ``meta/``.
+In v2.1 each episode has files of its own. In v3.0 many episodes share a file, and ``meta/episodes/`` says where in a
+film an episode begins. The readers need pyarrow and PyAV (``hypogoal[lerobot]``), but not the package lerobot.
 """
 
 import json
@@ -24,15 +24,15 @@ from hypogoal.data import opened, whole
 from hypogoal.importing.pictures import FILMS, count_frames, frames_in, picture_of
 from hypogoal.importing.states import HELDOUT, LABELLED, NAMED, UNLABELLED, Episode, files_of
 
-MINARI = Path("data") / "metadata.json"  # in a dataset's folder
-INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"
-OWNER = "episode_index"  # a column of every table
+MINARI = Path("data") / "metadata.json"  # in the folder of a Minari dataset
+INFO, EPISODES = Path("meta") / "info.json", Path("meta") / "episodes"  # in the folder of a LeRobotDataset
+OWNER = "episode_index"  # the column of every table that says whose episode a row is
 HDF5 = (".h5", ".hdf5")
 DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.py writes it; arrays as .npz."
 KEYS = "Choose those that have one by --key; () is a single value, None a broken link."
 MASK = "Give names of data/*, or take the mask out: del file['mask/valid']."
-TABLE = ".csv"  # labels of films, beside them
-# Of each set of states: what the names of its observations begin with, and those of its other arrays.
+TABLE = ".csv"  # a table of labels may lie beside films
+# For each set of states, the name of its observations, and the prefix of the names of its other arrays.
 SETS = {
     LABELLED: ("observations", ""),
     UNLABELLED: ("unlabelled", "unlabelled_"),
@@ -42,11 +42,14 @@ NPZ = "Give a .npz file that numpy.savez wrote, of numbers, not of Python object
 LABELS = "Give (N,), or (N, sub-goals) and --sub-goal NAME for each column: 1 where it holds, 0 where not."
 
 Arrays = dict[str, Array]  # by name
-Reader = Callable[[Path, Sequence[str]], Iterator[Episode]]  # from a source, the keys to read
+Reader = Callable[[Path, Sequence[str]], Iterator[Episode]]  # takes the source and the keys to read
 
 
 def reader_of(source: Path, left: Counter[str]) -> Reader | None:
-    """What reads a recording; None of what is none. ``left`` counts by suffix the files that are not read."""
+    """Return the reader of a recording, or None if ``source`` is no recording.
+
+    A reader of films counts other files in ``left``, by suffix.
+    """
     if (source / MINARI).exists():
         return read_minari
     if (source / INFO).exists():
@@ -58,9 +61,9 @@ def reader_of(source: Path, left: Counter[str]) -> Reader | None:
 
 
 def read_arrays(path: Path, left: Counter[str]) -> Arrays:
-    """The arrays of a file or a folder by name; observations of several keys are ``observations/front`` and so on.
+    """Read the arrays of a file or a folder, by name. Observations of several keys are ``observations/KEY``.
 
-    ``left`` counts other files of the folder.
+    Other files of the folder are counted in ``left``.
     """
     arrays = {"sub_goals": np.array(["sub-goal"]), "features": np.array([])}
     for file in files_of(path, (".npy",), left):
@@ -68,7 +71,8 @@ def read_arrays(path: Path, left: Counter[str]) -> Arrays:
         with reading(file, NPZ):
             arrays[inner.as_posix()] = np.load(file)
     if path.is_file():
-        with reading(path, NPZ), path.open("rb") as raw, np.load(raw) as stored:  # NumPy leaves a cut archive open
+        # The file is opened here, because NumPy leaves an archive open that was cut off.
+        with reading(path, NPZ), path.open("rb") as raw, np.load(raw) as stored:
             arrays.update(stored)
     return arrays
 
@@ -79,10 +83,11 @@ def episodes_of(
     group: str,
     left: Counter[str],
 ) -> Iterator[Episode]:
-    """The three sets of states as an episode each; labels that do not fit states and sub-goals are a ``UserError``.
+    """Return the three sets of states, each as one episode.
 
-    ``group`` names another array, (N,): labelled states with equal values there belong together, and unlabelled ones by
-    the array ``unlabelled_GROUP``. ``left`` counts arrays that are not read.
+    ``group`` names an array (N,). Labelled states with equal values in it belong together. For the other sets the array
+    is ``unlabelled_GROUP`` or ``heldout_GROUP``. Arrays that are not read are counted in ``left``. Raises ``UserError``
+    if labels do not fit the states and sub-goals.
     """
     if group and group not in arrays:
         names = ", ".join(arrays)
@@ -112,7 +117,7 @@ def episodes_of(
 
 
 def read_minari(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
-    """The episodes of a dataset in any of Minari's formats; T is one more than the steps."""
+    """Read the episodes of a dataset in any of Minari's formats. An episode has one frame more than steps."""
     import minari
 
     from hypogoal.domains.gymnasium.reader import recorded
@@ -130,7 +135,10 @@ def read_minari(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
 
 
 def _space_of(part: dict[str, Any]) -> Any:
-    """A space as Minari wrote it, its parts being spaces already, in their order: Minari itself sorts them."""
+    """Return a space that Minari wrote, with its parts in their order, where Minari itself would sort them.
+
+    ``part`` describes the space, and the spaces inside it have been made already.
+    """
     from gymnasium import spaces
     from minari.serialization import deserialize_space
 
@@ -143,7 +151,7 @@ def _space_of(part: dict[str, Any]) -> Any:
 
 
 def read_robomimic(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
-    """The demonstrations ``data/*/obs/KEY``; those that ``mask/valid`` lists are held out."""
+    """Read the demonstrations ``data/*/obs/KEY``. Demonstrations that ``mask/valid`` lists are held out."""
     with opened(source, DEMOS, "the recording") as file:
         demos = file["data"]
         masks = file.get("mask", {})
@@ -154,7 +162,7 @@ def read_robomimic(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
             strangers = sorted(valid.difference(demos))
             if strangers or not valid:
                 raise UserError("mask/valid names no demonstrations", f"{source}: {strangers[:NAMED]}", MASK)
-        by_number = sorted(demos, key=len)  # HDF5 lists names in order: demo_10 before demo_2
+        by_number = sorted(demos, key=len)  # because HDF5 lists demo_10 before demo_2
         for name in by_number:
             demo = demos[name]
             columns = {}
@@ -171,7 +179,10 @@ def read_robomimic(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
 
 
 def read_films(source: Path, keys: Sequence[str], left: Counter[str]) -> Iterator[Episode]:
-    """The films in a folder, an episode each, called by their path in it; each has one key, whatever ``keys`` say."""
+    """Read the films in a folder, each as an episode that is named by the film's path in the folder.
+
+    A film has the one key ``video``, whatever ``keys`` are.
+    """
     for file in files_of(source, FILMS, left):
         name = file.relative_to(source).with_suffix("")
         seen = {"video": partial(frames_in, file)}
@@ -180,7 +191,7 @@ def read_films(source: Path, keys: Sequence[str], left: Counter[str]) -> Iterato
 
 
 def read_lerobot(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
-    """The episodes of a dataset, with ``keys`` of its features beside all ``observation*``."""
+    """Read the episodes of a dataset. Observations are its features ``observation*`` and those that ``keys`` name."""
     info = json.loads((source / INFO).read_bytes())
     table_of = lru_cache(maxsize=1)(_table)  # the episodes of a file come together
     listed = _listed(source)
@@ -222,7 +233,7 @@ def read_lerobot(source: Path, keys: Sequence[str]) -> Iterator[Episode]:
 
 
 def _listed(source: Path) -> pd.DataFrame:
-    """What ``meta/`` says of each episode."""
+    """Return what ``meta/`` says of each episode, a row for each."""
     file = source / EPISODES.with_suffix(".jsonl")
     if file.exists():
         return pd.read_json(file, lines=True, encoding="utf-8-sig")
@@ -231,7 +242,7 @@ def _listed(source: Path) -> pd.DataFrame:
 
 
 def _cut_ends(listed: pd.DataFrame, head: str) -> None:
-    """Have each episode end in its film where the next one begins, at the latest."""
+    """Let each episode end in its film where the next episode begins, at the latest."""
     begin, end = f"{head}/from_timestamp", f"{head}/to_timestamp"
     if begin in listed:
         films = listed.sort_values(begin).groupby([f"{head}/chunk_index", f"{head}/file_index"])
@@ -240,7 +251,11 @@ def _cut_ends(listed: pd.DataFrame, head: str) -> None:
 
 
 def _facts(row: Mapping[Any, Any], head: str) -> dict[Any, Any]:
-    """The row of an episode with what it says of its table or film in v3.0: the file's numbers, and when it begins."""
+    """Return the row of an episode, with the numbers of its table or film, and the time when it begins there.
+
+    The keys added are ``chunk_index``, ``file_index`` and ``from_timestamp``. Their values are the row's ``head/*`` in
+    v3.0, and 0 in v2.1.
+    """
     facts = dict(row)
     for name in ("chunk_index", "file_index", "from_timestamp"):
         facts[name] = row.get(f"{head}/{name}", 0)
@@ -253,7 +268,7 @@ def _table(file: Path) -> pd.DataFrame:
 
 
 def _cells(file: Path, column: Any, rows: Ints) -> Iterator[Array]:
-    """The pictures in cells of a table, ``{bytes, path}``."""
+    """Return the pictures in some cells of a column. A cell is ``{bytes, path}``."""
     for cell in column.iloc[rows]:
         yield picture_of(cell["bytes"], file)
 
@@ -265,9 +280,9 @@ def _episode(
     keys: Sequence[str],
     role: str = "",
 ) -> Episode:
-    """An episode of arrays (T, ...) by key; those that are wanted have one T, or it is a ``UserError``.
+    """Return an episode of arrays (T, ...) by key. Raises ``UserError`` if arrays that are wanted differ in T.
 
-    A column that is shorter has no numbers for the last frames, and one that is longer has none at all.
+    A shorter column has NaN for the last frames, and a longer column has NaN for all frames.
     """
     shapes = {key: getattr(seen[key], "shape", None) for key in keys or seen if key in seen}
     lengths: set[tuple[int, ...]] = {(shape or ())[:1] for shape in shapes.values()}
@@ -283,7 +298,7 @@ def _episode(
 
 
 def _leaves(values: Any, place: str) -> dict[str, Any]:
-    """The datasets in a group by key: ``robot/position``."""
+    """Return the datasets in a group by key, such as ``robot/position``."""
     if not hasattr(values, "items"):
         return {place: values}
     leaves = {}

@@ -1,6 +1,6 @@
-"""Episodes, whatever they were read from, and their frames: chosen, and taken for pictures or numbers, key by key.
+"""Episodes from any source, and how their frames are chosen and taken for pictures or numbers, key by key.
 
-What is taken for what: the table in docs/own-domain.md.
+The table in docs/own-domain.md says what is taken for a picture and what for numbers.
 """
 
 import os
@@ -22,27 +22,28 @@ from hypogoal.observations import NUMBERS, PICTURE, spread_rows
 
 ROLES = LABELLED, UNLABELLED, HELDOUT = "labelled", "unlabelled", "heldout"
 STACKED = "Give pictures as uint8 (H, W, C); 'import --stack' puts stacked frames among the channels."
-MOST_COMPARED = 2_000  # rows of numbers that are compared before and after the cast to float32, spread evenly
+MOST_COMPARED = 2_000  # the most rows of numbers that are compared before and after the cast to float32
 LEFT = 0.9  # the share of a column's distinct values that float32 must keep
-ASIDE = {"__macosx", "thumbnails", "thumbs", "#recycle", "#snapshot", "$recycle.bin"}  # folders; and those with @
+# Folders that a system keeps for itself. Folders that begin with @ are left aside, too.
+ASIDE = {"__macosx", "thumbnails", "thumbs", "#recycle", "#snapshot", "$recycle.bin"}
 HERE = "Here are {}: pictures belong as PNG or JPEG into positive/, negative/ and unlabelled/, numbers into arrays."
 RENAME = "Rename one or take it out; films of one name may differ in their suffix."
-NAMED = 4  # columns that a message names
+NAMED = 4  # the most columns that a message names
 IN_FLOAT32 = "have values that float32 makes infinite, 0 or equal, or that are not finite"
 
 
 @dataclass(frozen=True)
 class Episode:
-    """Frames in order: a recorded episode, one picture, or a set of arrays.
+    """Frames in order, which are a recorded episode, one picture, or a set of arrays.
 
     Attributes:
-        name: what messages and tables of labels call it.
-        length: T, how many frames it has.
-        observations: by key, an array (T, ...), or a function from rising numbers of frames to what is seen in these,
-            one after another. The key is "" if there are none.
-        columns: (T,) by name, which may label frames.
-        role: one of ``ROLES``; empty if it may become any, as a whole.
-        group: with which others frames are held out, if at all: one name, or (T,) names; empty if they stand alone.
+        name: the episode's name in messages and in tables of labels.
+        length: T, the number of frames.
+        observations: by key, an array (T, ...), or a function that takes rising numbers of frames and returns these
+            frames' observations one after another. Without keys, the only key is "".
+        columns: by name, values (T,) that may label frames.
+        role: one of ``ROLES``, or empty if the whole episode may get any role.
+        group: the name of the group with which frames are held out, or names (T,). Empty: the frames have no group.
     """
 
     name: str
@@ -54,9 +55,10 @@ class Episode:
 
 
 def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> list[Path]:
-    """The visible files with these suffixes in a folder and those below it, sorted, links followed, each folder once.
+    """Return the visible files with one of ``suffixes`` in a folder and in the folders below it, sorted.
 
-    ``left`` counts the others by suffix, and folders that a system keeps for itself or a link leads back to.
+    Links are followed, but each folder is visited once. Other files are counted in ``left``, by suffix, and so are
+    folders that a system keeps for itself, or to which a link leads back.
     """
     taken = []
     passed = {*folder.resolve().parents}
@@ -82,14 +84,14 @@ def files_of(folder: Path, suffixes: Collection[str], left: Counter[str]) -> lis
 
 
 class Frames(NamedTuple):
-    """States in order, and what is known of them.
+    """Frames of all episodes in order, and what is known of them.
 
     Attributes:
-        table: a row for each frame, also those of which nothing is seen: ``name`` in messages, ``episode``, ``group``,
-            ``role``, whether it is ``kept``.
-        columns: of the episodes, a row for each frame.
-        seen: by key, a picture or numbers of each frame that is kept; by "" if there is one key.
-        channels: frames and colours of stacks by key, see :class:`hypogoal.data.Collected`.
+        table: a row for each frame, kept or not, with its ``name`` in messages, its ``episode``, ``group`` and
+            ``role``, and whether the frame is ``kept``.
+        columns: the episodes' columns, a row for each frame.
+        seen: by key, a picture or numbers for each frame that is kept. If there is one key, it is "".
+        channels: frames and colours of stacked pictures by key, see :class:`hypogoal.data.Collected`.
     """
 
     table: DataFrame
@@ -108,13 +110,13 @@ def frames_of(
     resize: int = 0,
     stack: bool = False,
 ) -> Frames:
-    """The frames of episodes; ``left`` counts what is not read.
+    """Read the frames of episodes. What is not read is counted in ``left``.
 
     Args:
-        keys: of observations; none: all.
-        every: keep each n-th frame, and the last.
-        resize: most pixels on the longer side of pictures; 0: as many as they have.
-        stack: axes of frames and colours become channels.
+        keys: the keys of observations to read. Empty: all keys.
+        every: n, if each n-th frame is kept, counted back from an episode's last frame.
+        resize: the most pixels on the longer side of a picture. 0: pictures keep their size.
+        stack: whether axes of frames and colours become channels.
     """
     tables, columns = [], []
     episode_names = set()
@@ -158,10 +160,10 @@ def _parts(
     kept: slice,
     left: Counter[str],
 ) -> dict[str, Iterable[Any]]:
-    """What is seen in the frames that are kept, by key, of all pictures and numbers if no keys are given.
+    """Return the observations in the frames that are kept, by key. Without ``keys``, all pictures and numbers are read.
 
-    An unknown key, one of another length, and none that can be read are a ``UserError``. In the names of several keys
-    / becomes a dot, since they are names of fields.
+    If there are several keys, a / in a key becomes a dot, because keys become names of fields. Raises ``UserError`` if
+    a key is unknown, if its observations have another length, or if nothing can be read.
     """
     parts = {}
     for key in sorted({*keys} or episode.observations):
@@ -195,13 +197,14 @@ def take(
     side: int = 0,
     stack: bool = False,
 ) -> tuple[Array, tuple[int, int] | None]:
-    """A state as read: a picture as uint8 (H, W, C), or numbers. What could be either is a ``UserError``.
+    """Return a state, as a picture, uint8 (H, W, C), or as numbers, and how its channels are stacked.
 
-    And how many frames, and colours of each, a picture's channels are; None if nobody stacked them.
+    The second value is how many frames of how many colours a picture's channels are, or None if nothing was stacked.
+    Raises ``UserError`` if the state cannot be read, or can be read in two ways.
 
     Args:
-        side: most pixels on a picture's longer side, 0: as many as it has.
-        stack: axes of frames and colours become channels.
+        side: the most pixels on a picture's longer side. 0: the picture keeps its size.
+        stack: whether axes of frames and colours become channels.
     """
     kind = reading_of(state.shape, state.dtype)
     fault = kind.fault
@@ -224,7 +227,10 @@ def take(
 
 
 def together(states: Sequence[Array], names: Sequence[str], subject: str) -> Array:
-    """States of one size (N, ...): pictures, where some are coloured all so, or numbers as float32."""
+    """Return states of one size as one array (N, ...), of pictures or of numbers, float32.
+
+    If some pictures are coloured, grey pictures become coloured. Raises ``UserError`` if states differ in size or type.
+    """
     if {state.shape[2:] for state in states} == {(1,), (3,)}:
         states = [state.repeat(3 // state.shape[2], axis=2) for state in states]
     first = states[0]
@@ -241,9 +247,9 @@ def together(states: Sequence[Array], names: Sequence[str], subject: str) -> Arr
 
 
 def as_numbers(values: Array, subject: str) -> Floats:
-    """Numbers (N, ...) as float32, compared before and after.
+    """Return numbers (N, ...) as float32.
 
-    Columns that are not finite, that float32 cannot hold, or whose values it cannot tell apart are a ``UserError``.
+    Raises ``UserError`` if a column has values that are not finite, or that float32 cannot hold or tell apart.
     """
     with np.errstate(over="ignore", under="ignore"):
         cast = values.astype(NUMBERS)

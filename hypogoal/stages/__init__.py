@@ -1,1 +1,1 @@
-"""The stages, one file each, and what those with options share (``agents.py``)."""
+"""The stages, one file each, and in ``agents.py`` what the stages with options share."""

@@ -1,4 +1,4 @@
-"""What ``train-options``, ``train-meta`` and ``audit`` share: their set-up, their manifest, training, files."""
+"""What ``train-options``, ``train-meta`` and ``audit`` share: set-up, manifest, training and files."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,22 +21,22 @@ from hypogoal.options.loop import OptionLoop
 
 
 def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Iterable[str]) -> Setup:
-    """An ensemble's options in its domain, by the stage's settings.
+    """Return the set-up of an ensemble's options in its domain, with the stage's settings.
 
-    Of options of an artefact, trained further, the ``fixed`` settings hold. Where other ones are typed, or these
-    options are of another ensemble, it is a ``UserError``.
+    If ``practice``, options that were trained before, is given, its ``fixed`` settings hold. Raises ``UserError`` if
+    other values of these settings are typed, or if ``practice`` is of another ensemble.
     """
     source = open_artefact(ensemble, "ensemble")
     held = {}
     if practice:
         require_ensemble(practice, source.path)
         held = {name: practice.config[name] for name in fixed if name in practice.config}
-        if practice.config["layouts"]:  # options of many layouts may be played in any
+        if practice.config["layouts"]:  # options of many layouts may be played on any layout
             held.pop("layout_seed", None)
     config = call.settings(PlayConfig, source.config["domain"], held)
     settings = config.flat()
     for name, value in held.items():
-        wanted = settings.get(name, value)  # a part's, where the network has that part
+        wanted = settings.get(name, value)  # a setting of a part is missing if the network lacks the part
         if wanted != value:
             fault = f"these options were trained with {name}={value}, not {wanted}"
             raise UserError(fault, None, f"Give --set {name}={value}, or leave it out.")
@@ -51,7 +51,7 @@ def setup_of(call: Call, ensemble: Path, practice: Artefact | None, fixed: Itera
 
 
 def require_ensemble(trained: Artefact, ensemble: Path) -> None:
-    """Refuse (``UserError``) options of another ensemble."""
+    """Raise ``UserError`` if the options ``trained`` are of another ensemble."""
     made_from = [entry.sha256 for entry in trained.manifest.inputs if entry.kind == "ensemble"]
     if sha256_of(ensemble) not in made_from:
         do = f"Train them from {ensemble}."
@@ -59,7 +59,7 @@ def require_ensemble(trained: Artefact, ensemble: Path) -> None:
 
 
 def description(setup: Setup, **more: Any) -> dict[str, Any]:
-    """An artefact's configuration: the stage's, what it takes from its ensemble's, and ``more``."""
+    """Return an artefact's configuration: the stage's, what comes from its ensemble's, and ``more``."""
     return setup.config.flat() | {
         "sub_goals": setup.source["sub_goals"],
         "members": setup.members,
@@ -71,9 +71,12 @@ def description(setup: Setup, **more: Any) -> dict[str, Any]:
 
 
 def learn(work: Training, setup: Setup, loop: OptionLoop, steps: int, until: float = 0.0) -> bool:
-    """Train for so many steps, see :func:`.train`, then write what was learned, and what happened meanwhile."""
+    """Train for ``steps`` steps, see :func:`.train`, then write what was learned, and what happened meanwhile.
+
+    Returns whether training ended because of ``until``.
+    """
     near = nearness(setup, loop.engine)
-    if near:  # so that a user's labels fail before training
+    if near:  # called once, so that a user's faulty labels fail before training
         near(np.repeat(loop.engine.ids[:1], setup.options), np.arange(setup.options))
     kept = work.draft.checkpoints()
     solved = train(loop, steps, work.log, work.progress, kept, until)
@@ -89,7 +92,7 @@ def learn(work: Training, setup: Setup, loop: OptionLoop, steps: int, until: flo
         save_tensors(folder / FILE, weights)
     config = setup.config
     layouts = config.layouts.strip()
-    if layouts.isdecimal():  # so many, from this one
+    if layouts.isdecimal():  # a number of layouts, from ``layout_seed`` on
         last = config.layout_seed + int(layouts) - 1
         layouts = f"{config.layout_seed}-{last}"
     write_layout(folder, loop.engine, config, setup.seed, layouts)

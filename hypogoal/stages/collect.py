@@ -1,4 +1,4 @@
-"""Collect labelled, unlabelled and held-out states of a domain into an HDF5 file."""
+"""The stage that collects labelled, unlabelled and held-out states of a domain into an HDF5 file."""
 
 from typing import Annotated, Any
 
@@ -20,8 +20,8 @@ from hypogoal.core.progress import Progress, say
 def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     """Collect labelled, unlabelled and held-out states.
 
-    ``domain`` is a name, or in Python a ``Domain``, which later stages find by its own name, in this process only.
-    ``out`` is an HDF5 file. ``resume`` keeps a complete one and begins an unfinished one anew.
+    ``domain`` is a name or, in Python, a ``Domain``, which later stages find by its own name, in this process only.
+    ``out`` is an HDF5 file. ``resume`` keeps a complete file, and begins an unfinished one anew.
     """
     from hypogoal.data import doubts_of, open_dataset, require_names, write_dataset
     from hypogoal.domains.base import BUILT_IN, load_domain
@@ -29,7 +29,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
 
     name = _name_of(domain)
     played = load_domain(name)
-    require_names(played.sub_goals)  # before play, not when the file is written
+    require_names(played.sub_goals)  # before play, because a fault would otherwise be told when the file is written
     config = call.settings(Config, name)
     settings = config.model_dump(mode="json")
     with call.draft(DATA, settings | {"domain": name}) as draft:
@@ -51,7 +51,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
 
 
 def _name_of(domain: Any) -> str:
-    """The name by which later stages find a domain."""
+    """Return the name by which later stages find a domain."""
     from hypogoal.domains.base import BUILT_IN, REGISTERED, load_domain
 
     if isinstance(domain, str):

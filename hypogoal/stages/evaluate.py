@@ -1,4 +1,4 @@
-"""Every number of the report, from whatever artefacts a run has; what is missing is named."""
+"""The stage that computes every number of the report from the artefacts of a run, and names what is missing."""
 
 from pathlib import Path
 from typing import Annotated
@@ -28,9 +28,9 @@ def evaluate(
 ) -> Done:
     """Compute every number of a run, such as accuracies and choices.
 
-    ``run`` is a folder with ensemble, options, meta and baseline artefacts, any of them. ``out`` gets ``numbers.csv``,
-    each question's ``tables/*.csv``, ``run.json`` (what is missing, provenance), ``arrays.h5`` and, of a run of an
-    experiment, ``results.csv``.
+    ``run`` is a folder with any ensemble, options, meta and baseline artefacts. ``out`` gets ``numbers.csv``, each
+    question's ``tables/*.csv``, ``run.json`` (what is missing, provenance) and ``arrays.h5``. If an experiment made the
+    run, ``out`` also gets ``results.csv``.
     """
     from hypogoal.core.processes import prepare
     from hypogoal.data import create_hdf5
@@ -46,7 +46,7 @@ def evaluate(
     trained = [artefact.path for artefact in contents.everything()]
     with call.draft("evaluation", settings, [*contents.data(), *trained]) as draft:
         for path in trained:
-            open_artefact(path)  # refuses changed files
+            open_artefact(path)  # raises UserError if files were changed
         times = 1 + len(played)
         parts = len(contents.ladders) + times * len(contents.agents)
         for ensemble in contents.ensembles:

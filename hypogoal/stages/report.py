@@ -1,4 +1,4 @@
-"""Draw an evaluated run as one self-contained HTML page, and its figures as files."""
+"""The stage that draws an evaluated run as one self-contained HTML page, and its figures as files."""
 
 from itertools import chain
 from pathlib import Path
@@ -11,7 +11,7 @@ from hypogoal.command.stage import stage
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
 
-MOST_BYTES = 2_000_000  # of a film on the page
+MOST_BYTES = 2_000_000  # a larger film is not shown on the page
 FILMS = "How many films of the agent to write as videos/*.gif; the page shows one of them. Default: one, if possible."
 
 
@@ -26,8 +26,8 @@ def report(
 ) -> Done:
     """Draw the report of an evaluated run as one HTML file.
 
-    ``out`` gets the page ``index.html``, ``figures/*.svg`` and, of so many ``videos``, which the first agent of the run
-    plays, ``videos/*.gif``. With ``figures``, a folder, only the paper's figures are drawn.
+    ``out`` gets the page ``index.html`` and ``figures/*.svg``. ``videos`` is how many episodes of the run's first agent
+    are filmed into ``videos/*.gif``. With ``figures``, a folder, only the paper's figures are drawn.
     """
     if figures is not None:
         from hypogoal.evaluation.figure_files import draw_figures

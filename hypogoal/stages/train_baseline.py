@@ -1,4 +1,4 @@
-"""Train a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
+"""The stage that trains a comparison agent with the primitive actions: stable-baselines3's PPO or DQN."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ def train_baseline(
 ) -> Done:
     """Train PPO or DQN without options, to compare.
 
-    Without ``data`` it plays in the world of the domain's defaults.
+    Without ``data``, the agent plays in the world of the domain's defaults.
     """
     from hypogoal.baselines import agents
     from hypogoal.baselines.engine_env import EngineEnv

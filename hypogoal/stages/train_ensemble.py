@@ -1,4 +1,4 @@
-"""Train one ensemble of hypotheses per sub-goal; the sub-goals are independent and share the cores."""
+"""The stage that trains one ensemble of hypotheses per sub-goal. Sub-goals are independent, and share the cores."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -39,8 +39,8 @@ def train_ensemble(
 ) -> Done:
     """Train diverse classifiers (members) for each sub-goal.
 
-    ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead
-    of those of ``data``. Each sub-goal has a progress line and a folder of TensorBoard's of its own.
+    ``unlabelled`` are data files, or artefacts with visited states, whose unlabelled states are taken instead of those
+    of ``data``. Each sub-goal has its own progress line, and its own folder for TensorBoard.
     """
     from hypogoal.core.processes import allowed, in_processes
     from hypogoal.data import open_dataset
@@ -90,7 +90,7 @@ def train_ensemble(
 
 
 def _choice(sub_goal: str, chosen: Mapping[str, Any]) -> Iterator[str]:
-    """What was chosen for a sub-goal, and which of its members are no hypotheses."""
+    """Yield lines on what was chosen for a sub-goal, and on which of its members are no hypotheses."""
     trials = chosen["tried"]
     if trials:
         held_out = f"{chosen['positives']} positives, {chosen['negatives']} negatives held out"
@@ -115,7 +115,7 @@ def _choice(sub_goal: str, chosen: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _outcome(accuracies: Sequence[dict[str, float]]) -> list[str]:
-    """Best, mean and worst member, means over the sub-goals that can be judged."""
+    """Return a line on the best, mean and worst member, as means over the sub-goals that can be judged."""
     means = {}
     for name, title in TITLES.items():
         values = [each[name] for each in accuracies if not isnan(each[name])]

@@ -1,6 +1,6 @@
-"""Learn the meta-policy over all options while their policies go on learning.
+"""The stage that learns the meta-policy over all options while their policies go on learning.
 
-Without ``--options`` the policies start fresh, as in the paper; with it they continue, and the steps already spent
+Without ``--options`` the policies start fresh, as in the paper. With it they continue, and the steps already spent
 count in every curve.
 """
 
@@ -13,11 +13,11 @@ from hypogoal.command.call import Call, Done, outcome_of
 from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
 
-FIXED = (  # as of the options trained before
+FIXED = (  # settings that must be as of the options trained before
     *("network", "recurrence", "embedding", "termination"),
     *("layout_seed", "start", "option_timeout"),
 )
-WORLD = ("domain_config", "cap", "max_episode_steps")  # where these differ, the agent does not count practice episodes
+WORLD = ("domain_config", "cap", "max_episode_steps")  # if these differ, the agent does not count practice episodes
 
 
 @stage(
@@ -38,7 +38,8 @@ def train_meta(
 ) -> Done:
     """Learn from the reward which options to choose.
 
-    Options start fresh, or continue as those of an ``options`` artefact; so does choosing, as an ``agent`` chose.
+    Options start fresh, or continue as those of an ``options`` artefact. Choosing starts fresh, or continues as the
+    agent ``agent`` chose.
     """
     from hypogoal.core.tensors import load_tensors
     from hypogoal.domains.episodes import PlayedEpisode

@@ -1,4 +1,4 @@
-"""Learn every member's option policy while options are chosen at random, for a time or until that succeeds."""
+"""The stage that learns every member's option policy while options are chosen at random or evenly."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,7 +9,7 @@ from hypogoal.command.call import Call, Done, outcome_of
 from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
 
-FIXED = ("network", "recurrence", "embedding", "termination")  # as of the options trained before
+FIXED = ("network", "recurrence", "embedding", "termination")  # must be as of the options trained before
 
 
 @stage(
@@ -27,7 +27,7 @@ def train_options(
 ) -> Done:
     """Learn an option (a policy) for every member.
 
-    ``options``, an artefact, are trained further.
+    If ``options``, an artefact, is given, its options are trained further.
     """
     from hypogoal.meta import training
     from hypogoal.meta.config import TrainOptionsConfig
@@ -54,7 +54,7 @@ def train_options(
             away = distances_of(setup.domain, setup.source["sub_goals"], setup.members)
             recorder.write_executions(work.draft.files, away)
         if config.until:
-            settings["ended_at"] = recorder.steps  # for the manifest, which comes last
+            settings["ended_at"] = recorder.steps  # the manifest, which is written last, has these settings
             settings["until_reached"] = solved
     counts: dict[str, Any] = dict(recorder.episodes.counts())
     numbers = counts | recorder.recent(restarted=config.restart_options)

@@ -1,1 +1,1 @@
-"""Tools beside the stages: audits of classifiers, runs side by side, exports for other software."""
+"""Tools beside the stages: audits of classifiers, comparisons of runs, imports and exports."""

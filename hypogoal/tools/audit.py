@@ -1,4 +1,4 @@
-"""How often policies fool a success classifier, where, and what a mend changes."""
+"""The command that tells how often policies fool a success classifier, where, and what a mend changes."""
 
 import json
 from functools import partial
@@ -40,9 +40,10 @@ def audit(
 ) -> Done:
     """Say how often, and where, policies fool a success classifier.
 
-    A policy is trained against it, and beside it one against the mended one. The classifier is a ``member`` of an
-    ensemble artefact, or ``module:function`` from observations (N, *obs) to probabilities (N,). The truth is that of
-    the domain's ``sub_goal``. Without a domain it is audited on recorded data.
+    A policy is trained against the classifier and, if ``mend`` is set, a second policy against the mended classifier.
+    The classifier is a ``member`` of an ensemble artefact, or ``module:function`` from observations (N, *obs) to
+    probabilities (N,). The truth is that of the domain's ``sub_goal``. Without a domain, the classifier is audited on
+    recorded data.
     """
     from hypogoal.tools.audit_recorded import audited
 
@@ -67,7 +68,7 @@ def _in_play(
     sub_goal: str,
     member: int,
 ) -> tuple[list[str], dict[str, float | None]]:
-    """Train and play the policies: the findings in lines, and the shares of false positives."""
+    """Train and play the policies. Return the findings in lines, and the shares of false positives."""
     from hypogoal.core.files import as_json
     from hypogoal.core.seeding import rng_for
     from hypogoal.domains.base import load_domain
@@ -110,14 +111,17 @@ def _in_play(
             rng = rng_for(call.seed, "random-play")
             report["random_play"] = played.random_play(loop, column, rng)
             (files / REPORT).write_text(as_json(report) + "\n", encoding="utf-8")
-    except Complete as complete:  # what was found stands, and may still fail
+    except Complete as complete:  # what was found earlier counts, and may fail again
         say(complete, err=True)
     findings = json.loads((call.out / REPORT).read_bytes())
     return lines_of("played.txt", **findings), played.shares_of(findings)
 
 
 def _policies(config: "AuditConfig", threshold: float) -> dict[str, float]:
-    """The probability above which predictions are positive for each policy that is wanted."""
+    """Return, by the name of each policy, the probability above which predictions are positive.
+
+    Raises ``UserError`` if ``mend`` is not above the threshold, or if options are to end at the truth.
+    """
     if config.termination == "oracle":
         raise UserError("an audit takes one classifier only", "termination=oracle", "Leave it out.")
     threshold = config.threshold or threshold

@@ -1,8 +1,8 @@
 """How often policies fool a success classifier, and where.
 
 A classifier can be right in nearly all states that are met, and wrong where a policy stops that was trained to reach
-its positive predictions. So options are learned that end at these, and the truth of each of their executions is looked
-up.
+its positive predictions. So options are learned that end at positive predictions, and the truth of each of their
+executions is looked up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,10 +31,10 @@ from hypogoal.options.termination import Terminations, load_rule
 from hypogoal.tools.classifiers import Classifier
 
 BEFORE, MENDED = POLICIES = ("before", "mended")
-CELL = 8  # of positions that count as one place
-FILMS = 4  # kinds that are shown
-RANDOM_STEPS = 4_000  # of random play
-DECIMALS = 6  # of a threshold, which float32 log-odds round
+CELL = 8  # side of a cell, whose positions count as one place
+FILMS = 4  # kinds that get a film
+RANDOM_STEPS = 4_000  # steps of random play
+DECIMALS = 6  # decimals of a threshold, which float32 log-odds round
 
 
 def terminations_of(
@@ -44,7 +44,7 @@ def terminations_of(
     setup: Setup,
     engine: Engine,
 ) -> Terminations:
-    """Options that end at a member's positives, one for each policy's threshold."""
+    """Return terminations at a member's positives for one option per policy, each with its policy's threshold."""
 
     def log_odds(ids: Ints) -> Floats:
         of_members = classifier.log_odds(engine.images(ids))
@@ -64,7 +64,10 @@ def random_play(
     column: int,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """The classifier's scores, of sub-goal number ``column``, on the states that random actions lead to, each once."""
+    """Return the classifier's scores on the distinct states to which random actions lead.
+
+    ``column`` is the number of the sub-goal.
+    """
     engine = loop.engine
     engine.reset()
     ids = states_met(engine, RANDOM_STEPS, rng)
@@ -81,7 +84,7 @@ def random_play(
 
 
 def shares_of(report: Mapping[str, Any]) -> dict[str, float | None]:
-    """The shares of false positives: of the last executions of policies, of the states that random play met."""
+    """Return the shares of false positives: of policies' last executions, and of the states that random play met."""
     return {"policy": report[BEFORE]["fires_far"], "play": report["random_play"]["false_positives"]}
 
 
@@ -92,10 +95,10 @@ def findings(
     sub_goals: Sequence[str],
     folder: Path,
 ) -> dict[str, Any]:
-    """How the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
+    """Return how the last executions of a policy ended, by their ``exploits.csv``: its part of ``audit.json``.
 
-    False positives are of one kind where the same sub-goals hold, in the same cell if that is known. Of each of the
-    most frequent kinds a film is put into ``folder``, of pictures.
+    False positives are of one kind if the same sub-goals hold, in the same cell if that is known. For each of the most
+    frequent kinds, a film is written to ``folder`` if observations are pictures.
     """
     engine = loop.engine
     threshold = expit(loop.terminations.rule.thresholds[option].astype(float))
@@ -138,7 +141,10 @@ def _write_film(
     name,
     run,
 ):
-    """An execution that ended in a false positive, from where it began; False where it cannot be drawn."""
+    """Write a film of an execution that ended in a false positive, from where it began.
+
+    Returns False if the execution cannot be drawn.
+    """
     ids = np.array([run.began, *run.states])
     engine, timeout = loop.engine, loop.config.option_timeout
     if engine.observation_dtype != PICTURE or not engine.remembers(ids).all():

@@ -1,6 +1,6 @@
 """An audit of recorded data, without a simulator.
 
-Where members disagree, which failures they take for a success, and which states to label next.
+It says where members disagree, which failures they take for a success, and which states to label next.
 """
 
 from collections.abc import Mapping
@@ -26,10 +26,10 @@ from hypogoal.observations import digest, spread_rows
 from hypogoal.tools.classifiers import Classifier, classifier_of
 
 NEXT = 100  # states to label next in the table
-# Of the table: the picture's file, the label (1, 0 or nothing yet), the row among the unlabelled states and its
-# :func:`hypogoal.observations.digest`, how much members disagree.
+# Columns of the table: the picture's file, the label (1, 0 or nothing yet), the row among the unlabelled states, the
+# state's :func:`hypogoal.observations.digest`, and how much members disagree.
 COLUMNS = ["name", "label", "row", "digest", "disagreement"]
-CARDS, FAILURES = 20, 4  # on the page: of these, and of each member's failures
+CARDS, FAILURES = 20, 4  # on the page: states to label next, and each member's failures
 
 
 def audited(
@@ -39,9 +39,10 @@ def audited(
     sub_goal: str | None,
     member: int | None,
 ) -> tuple[list[str], dict[str, float | None]]:
-    """An audit without a simulator, of a function or of all members of an ensemble; else as in play.
+    """Audit a function, or all members of an ensemble, on recorded data.
 
-    ``out`` gets ``audit.json``, the page ``index.html`` and, for each sub-goal (or the named one), ``next/SUB_GOAL/``.
+    ``call.out`` gets ``audit.json``, the page ``index.html`` and, for each sub-goal (or the named one),
+    ``next/SUB_GOAL/``. Returns lines to print, and the largest share of failures that are false positives.
     """
     is_ensemble = Path(source).is_dir()
     if member is not None or call.typed or call.preset or call.resume or not (data or is_ensemble):
@@ -91,11 +92,12 @@ def findings_of(
     dataset: Dataset,
     sub_goal: str,
 ) -> dict[str, Any]:
-    """What it says of a data file's states, and which to label next.
+    """Return what a classifier says of a data file's states, and which states to label next.
 
-    Returns ``numbers`` of ``audit.json``; ``thresholds`` (K,); of unlabelled states to label next, best first, ``rows``
-    (which they are), ``disputed`` (how much members disagree), ``states`` and ``scores``, what members say (n, K);
-    ``failures``: of each member those that it scores highest, a list of states and one of all members' scores.
+    The result has ``numbers`` for ``audit.json``, and ``thresholds`` (K,). Of the unlabelled states to label next, best
+    first, it has the rows ``rows``, how much members disagree ``disputed``, the ``states``, and what members say,
+    ``scores`` (n, K). ``failures`` has, for each member, the negatives that it scores highest, and all members' scores
+    of them.
     """
     thresholds = np.array(classifier.thresholds.tolist())
     known = joined([dataset.labelled(sub_goal), dataset.heldout(sub_goal)])
@@ -134,7 +136,10 @@ def findings_of(
 
 
 def write_next(folder: Path, findings: Mapping[str, Any]) -> None:
-    """Write the states to label next: a table to fill in, and pictures ``001.png``, ... in its order, if they are."""
+    """Write the states to label next: a table to fill in and, if states are pictures, a file of each.
+
+    The files ``001.png``, ... are in the order of the table.
+    """
     folder.mkdir(parents=True)
     lines = []
     each = zip(findings["rows"], findings["states"], findings["disputed"], strict=True)
@@ -155,7 +160,10 @@ def member_table(
     scores: Array,
     thresholds: Array,
 ) -> pd.DataFrame:
-    """A row for each member: its false positives among known states (N, K), its predictions of others (M, K)."""
+    """Return a row for each member.
+
+    The row has the member's false positives among known states (N, K), and its predictions of other states (M, K).
+    """
     positive = scores > thresholds
     alone = positive & (positive.sum(axis=1, keepdims=True) == 1)
     of_failures = known_scores[~labels]

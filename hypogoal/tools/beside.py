@@ -21,19 +21,19 @@ from hypogoal.evaluation.questions import QUESTIONS, Context, Question, context_
 from hypogoal.evaluation.run import Results
 from hypogoal.evaluation.statistics import pairs
 
-Runs = Mapping[str, Results]  # by a run's label
-Shared = Mapping[Question, Mapping[str, Context]]  # see :func:`shared`
+Runs = Mapping[str, Results]  # results by a run's label
+Shared = Mapping[Question, Mapping[str, Context]]  # contexts by question and run, see :func:`shared`
 FIRST = 4  # lines that the page begins with
 
 
 def labels_of(paths: Sequence[str]) -> list[str]:
-    """Short names of runs: what their paths have not in common."""
+    """Return short names of runs: their paths without the folder that all have in common."""
     common = os.path.commonpath([os.path.dirname(path) for path in paths])
     return [os.path.relpath(path, common) for path in paths]
 
 
 def shared(runs: Runs) -> Shared:
-    """The questions of which every run has results, and what these are, by the run's label."""
+    """Return the questions for which every run has results, and the contexts of each question, by the run's label."""
     questions = {}
     for question in filter(attrgetter("beside"), QUESTIONS):
         contexts = {}
@@ -50,14 +50,14 @@ def of_runs(
     contexts: Mapping[str, Context],
     name: str,
 ) -> DataFrame:
-    """The tables of this name, one run's after another's, with a column ``run``."""
+    """Return the tables called ``name`` of all runs, one after another, with a column ``run``."""
     return pd.concat([context[name].assign(run=label) for label, context in contexts.items()])
 
 
 def why_not(runs: Runs, questions: Shared) -> str | None:
-    """Why runs cannot be compared, in a few words; None where they can.
+    """Return why runs cannot be compared, in a few words, or None if they can.
 
-    They must be of one domain and have at least one kind of result in common.
+    They must be of one domain, and have at least one kind of result in common.
     """
     domains = {label: ", ".join(domains_of(results)) for label, results in runs.items()}
     if len({*domains.values()}) > 1:
@@ -67,7 +67,7 @@ def why_not(runs: Runs, questions: Shared) -> str | None:
 
 
 def differences(runs: Runs) -> DataFrame:
-    """What was not the same, a column per run: settings by the kind of artefact, seeds, data and versions."""
+    """Return what differs, a column per run: settings by the kind of artefact, seeds, data and versions."""
     settings = [settings_of(results).assign(run=label) for label, results in runs.items()]
     cells = pd.concat(settings).sort_values("text").groupby(["of", "setting", "run"])
     by_run = cells["text"].agg(", ".join).unstack()[[*runs]].fillna(DASH)
@@ -75,22 +75,22 @@ def differences(runs: Runs) -> DataFrame:
 
 
 def compare_runs(questions: Shared) -> DataFrame:
-    """The first run against each other, ``agent`` by agent and method by method, over what they share."""
+    """Return comparisons of the first run with each other, method by method, over the results that both have."""
     parts = []
     for contexts in questions.values():
         for method, alike in of_runs(contexts, "compared").groupby("method", sort=False):
             if alike["run"].nunique() == len(contexts):
                 solved = alike.loc[alike["of"] == "success", "value"]
                 if len(solved) and not solved.any():
-                    alike = alike[alike["of"] != "length"]  # that of the limit, where nobody solved an episode
+                    alike = alike[alike["of"] != "length"]  # the limit, if nobody solved an episode
                 both = pairs(alike.assign(method=alike["run"]))
-                if not both.empty:  # some runs share a layout and a seed
+                if not both.empty:  # runs that share a layout and a seed are paired
                     parts.append(both.assign(of=method))
     return pd.concat(parts) if parts else DataFrame(columns=["N", "quantity", "first", "second", "of"])
 
 
 def winners(compared: DataFrame) -> list[str]:
-    """Who wins, by how much, on what: a line for each of :func:`compare_runs`; a winner where its interval has one."""
+    """Return a line for each row of :func:`compare_runs`: who wins by how much on what, if the interval says so."""
     rows = compared.astype(object).where(compared.notna(), None)
     return lines_of("winners.txt", pairs=rows.to_dict("records"))
 
@@ -100,7 +100,7 @@ def page_of(
     questions: Shared,
     paths: Sequence[str],
 ) -> tuple[str, list[Drawn], dict[str, DataFrame]]:
-    """The page of a comparison, its figures, and its tables by name."""
+    """Return the page of a comparison, its figures, and its tables by name."""
     tables = {
         "pairs": compare_runs(questions),
         "differences": differences(runs),
@@ -135,7 +135,7 @@ def page_of(
 
 
 def _curves(runs: Runs) -> Iterator[Drawn]:
-    """Of each agent that every run has its reward and length, a line per run."""
+    """Yield a figure for each method of which every run has a curve, a line per run."""
     points = [results.of(quantity=[*curves.FIGURES]).assign(run=label) for label, results in runs.items()]
     every = pd.concat(points).dropna(subset="step")
     for (name, quantity), drawn in every.groupby(["method", "quantity"]):

@@ -1,4 +1,4 @@
-"""What audits are of: the members of an ensemble, or code of the user's own."""
+"""What is audited: the members of an ensemble, or code of the user's own."""
 
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,15 @@ from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.observations import Observations
 
 CHUNK = 256  # observations that own code is given at once
-ASKED_AGAIN = 2_000  # observations, before it is believed that each has one probability
-CLOSE = 0.01  # between probabilities that are the same up to rounding, also in half precision
+ASKED_AGAIN = 2_000  # observations of which some are asked again, to see that each has one probability
+CLOSE = 0.01  # probabilities this close are equal up to rounding, also in half precision
 
 
 class OwnClassifier:
-    """Code of the user's own, ``module:function``, as an ensemble of one member; anything else is a ``UserError``."""
+    """The user's own code, ``module:function``, which is used as an ensemble of one member.
+
+    Raises ``UserError`` if the name is not that of a function.
+    """
 
     thresholds = np.array([THRESHOLD])
 
@@ -37,7 +40,10 @@ class OwnClassifier:
             raise UserError("this is not a function", name, do)
 
     def predict(self, observations: Observations) -> Any:
-        """Probabilities (n, 1) of observations (n, *obs)."""
+        """Return the probabilities, float64 (n, 1), of observations (n, *obs).
+
+        Raises ``UserError`` if an answer is no array of probabilities, or if a state gets two different ones.
+        """
         parts = []
         for some in np.split(observations, range(CHUNK, len(observations), CHUNK)):
             probabilities = self._ask(some)
@@ -52,7 +58,7 @@ class OwnClassifier:
         return np.concatenate(parts)[:, None]
 
     def _ask(self, some: Observations) -> Doubles:
-        """What it says of copies of observations, which it may change."""
+        """Return the probabilities of observations. The function gets copies, because it may change them."""
         self.asked += len(some)
         answer = self.function(some.copy())
         if isinstance(answer, torch.Tensor):
@@ -60,14 +66,14 @@ class OwnClassifier:
         try:
             probabilities = np.asarray(answer, float)
         except (TypeError, ValueError, RuntimeError):
-            probabilities = np.array(np.nan)  # words, for example
+            probabilities = np.array(np.nan)  # the answer was words, for example
         if probabilities.shape != (len(some),) or not ((probabilities >= 0) & (probabilities <= 1)).all():
             fault = f"the classifier gave {type(answer).__name__} {probabilities.shape} {probabilities.ravel()[:3]}"
             raise UserError(fault, self.name, f"Give probabilities, 0 to 1, float ({len(some)},).")
         return probabilities
 
     def log_odds(self, observations: Observations) -> Any:
-        """Log-odds (n, 1) of observations (n, *obs)."""
+        """Return the log-odds, float64 (n, 1), of observations (n, *obs)."""
         return log_odds_of(self.predict(observations))
 
 
@@ -79,7 +85,10 @@ def classifier_of(
     sub_goal: str,
     device: str,
 ) -> tuple[Classifier, Artefact | None]:
-    """The members of an ensemble artefact, and that, or code of the user's own; anything else is a ``UserError``."""
+    """Return the members of an ensemble artefact and the artefact, or the user's own code and None.
+
+    Raises ``UserError`` if ``name`` is neither.
+    """
     if ":" in name and not Path(name).is_dir():
         return OwnClassifier(name), None
     source = open_artefact(Path(name), "ensemble")

@@ -1,4 +1,4 @@
-"""Several evaluated runs side by side, as one page and its numbers."""
+"""The command that puts several evaluated runs side by side, as one page and its numbers."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,8 @@ def compare(
 ) -> Done:
     """Put evaluated runs side by side, and say which one wins.
 
-    Fewer than two runs, one twice, or runs that were not evaluated or cannot be compared are a ``UserError``.
+    Raises ``UserError`` if there are fewer than two runs, if a run is named twice, if a run was not evaluated, or if
+    the runs cannot be compared.
     """
     from hypogoal.evaluation.page import write
     from hypogoal.evaluation.run import evaluation_of, read_evaluation

@@ -1,4 +1,4 @@
-"""An agent's episodes or an ensemble, written for other software."""
+"""The command that writes an agent's episodes, or an ensemble, for other software."""
 
 import inspect
 import json
@@ -18,7 +18,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.observations import PICTURE, fields_of
 
-NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")  # of a Minari dataset
+NAME = re.compile(r"[A-Za-z0-9_-]+-v\d+")  # names of Minari datasets
 SOURCE = (
     "An agent (meta): its episodes become a Minari dataset, which 'import' reads. Or an ensemble: a folder that torch "
     "and safetensors load without hypogoal."
@@ -56,8 +56,8 @@ def export(
 ) -> Done:
     """Write an agent's episodes or an ensemble for other software.
 
-    An ensemble becomes a folder that torch and safetensors load without hypogoal, a meta artefact a Minari dataset of
-    so many ``episodes``. ``seed`` is of its agent's choices.
+    An ensemble becomes a folder that torch and safetensors load without hypogoal. A meta artefact becomes a Minari
+    dataset with ``episodes`` episodes of its agent, whose choices ``seed`` seeds.
     """
     artefact = open_artefact(source, "meta", "ensemble")
     if artefact.kind == "ensemble":
@@ -76,9 +76,9 @@ def export(
 
 
 def write_hub(artefact: Artefact, folder: Path) -> None:
-    """Write an ensemble's weights, the layers that they are of, ``load.py`` and a card.
+    """Write an ensemble's weights, the layers that the weights are of, ``load.py`` and a card.
 
-    Members with layers or a view of the user's own are a ``UserError``.
+    Raises ``UserError`` if the members have layers or a view of the user's own.
     """
     from hypogoal.hypotheses import load
     from hypogoal.hypotheses.config import FULL
@@ -114,13 +114,13 @@ def write_hub(artefact: Artefact, folder: Path) -> None:
 
 
 def _layers(network: Any, source: Path) -> list[tuple[str, dict[str, Any]]]:
-    """The names and arguments of a network's layers, from which ``load.py`` builds them."""
+    """Return the names and arguments of a network's layers, from which ``load.py`` builds them."""
     from torch import nn
 
     from hypogoal.hypotheses.load import ByKey
 
     rows = []
-    for layer in network:  # also one that is there twice
+    for layer in network:  # a layer that is there twice is listed twice
         kind = type(layer)
         if isinstance(layer, ByKey):
             encoders = [_layers(encoder, source) for encoder in layer.encoders]
@@ -139,7 +139,7 @@ def _layers(network: Any, source: Path) -> list[tuple[str, dict[str, Any]]]:
 
 
 def write_episodes(meta: Artefact, folder: Path, name: str, seed: int, progress: Progress) -> None:
-    """Let the agent of a meta artefact play as a Minari dataset of this name.
+    """Let the agent of a meta artefact play, and write its episodes as the Minari dataset ``name``.
 
     ``infos/option`` is the option that led to each state, -1 at the start.
     """
@@ -174,7 +174,7 @@ def write_episodes(meta: Artefact, folder: Path, name: str, seed: int, progress:
 
 
 def _buffers(episodes: Iterable[Any], progress: Progress) -> Iterator[Any]:
-    """Episodes as minari takes them."""
+    """Yield episodes as minari takes them."""
     from minari.data_collector import EpisodeBuffer
 
     for observations, steps in episodes:

@@ -1,4 +1,4 @@
-"""From what users have to a data file."""
+"""The command that makes a data file of what users have."""
 
 from collections import Counter
 from pathlib import Path
@@ -20,7 +20,7 @@ NAMING = "Recordings are labelled by --label NAME=RULE, arrays and pictures have
 
 
 def _label(text: str) -> tuple[str, str]:
-    """``NAME=RULE`` as a pair."""
+    """Return ``NAME=RULE`` as a pair."""
     name, _, rule = text.partition("=")
     if not (name and rule):
         raise UserError("--label needs NAME=RULE", text, "For example --label won=next.success.")
@@ -47,9 +47,9 @@ def import_data(
 ) -> Done:
     """Make a data file of your arrays, pictures or recorded episodes.
 
-    ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of pictures, or episodes: Minari's, a
-    LeRobotDataset, robomimic's HDF5, a folder of films, whose labels are rules of ``label``. Or it is a data file, and
-    ``label`` names a table of its states, which move to the labelled ones.
+    ``source`` is a ``.npz`` file, a folder of ``.npy`` files, a folder of pictures, or episodes. Episodes are Minari's,
+    a LeRobotDataset, robomimic's HDF5 or a folder of films; ``label`` has the rules by which they are labelled. If
+    ``source`` is a data file, ``label`` names a table of its states, which become labelled states.
     """
     from hypogoal import look
     from hypogoal.core.artefacts import DATA, kind_of
@@ -76,7 +76,7 @@ def import_data(
             remarks = add_labels(source, file, name, Path(table), call.seed)
         else:
             of_pictures = (source / POSITIVE).is_dir()
-            left: Counter[str] = Counter()  # what is not read
+            left: Counter[str] = Counter()  # counts of what is not read, by kind
             reader = None if of_pictures else reader_of(source, left)
             if bool(rules) != bool(reader) or (rules and sub_goal):
                 fault = "this is no recording" if rules and not reader else "nothing says where the sub-goal holds"

@@ -12,20 +12,20 @@ from hypogoal.data import SPLITS, States, open_dataset
 from hypogoal.evaluation.pictures import coloured
 from hypogoal.observations import PICTURE, spread_rows
 
-MOST_STATES = 60  # on a sheet
+MOST_STATES = 60  # states on a sheet
 COLUMNS = 10
 GAP = 2  # pixels around each state
-PLACES = ("room", "layout_seed")  # origins of which each value gets sheets of its own: the first that there is
+PLACES = ("room", "layout_seed")  # origins; each value of the first that states have gets its own sheets
 
 
 def write_sheets(
     path: Path,
     folder: Path,
 ) -> list[Path]:
-    """Draw a data file's labelled and held-out states, a picture for each room and label, to check labels by eye.
+    """Draw a data file's labelled and held-out states, a picture for each room and label. Return the files written.
 
-    The files are ``labelled/SUB_GOAL/room-01-positives.png`` and so on in ``folder``. A path that is no data file and
-    states that are not pictures are a ``UserError``.
+    The files are ``labelled/SUB_GOAL/room-01-positives.png`` and so on in ``folder``. Raises ``UserError`` if ``path``
+    is no data file, or if the states are not pictures.
     """
     if not path.is_file():
         raise UserError(
@@ -52,7 +52,10 @@ def write_sheets(
 
 
 def sheets(split: States) -> Iterator[tuple[str, Bytes]]:
-    """A sheet of each room and label, with its name, such as ``room-01-positives``; states are spread over them."""
+    """Yield the name and the picture of a sheet for each room and label, such as ``room-01-positives``.
+
+    If there are too many states, those that are shown are spread over all.
+    """
     origin = next((name for name in PLACES if name in split.origins), "")
     places = split.origins.get(origin, np.zeros(len(split.labels)))
     for place in np.unique(places):
@@ -65,7 +68,7 @@ def sheets(split: States) -> Iterator[tuple[str, Bytes]]:
 
 
 def sheet(observations: Bytes) -> Bytes:
-    """Observations uint8 (n, H, W, C) in rows of ``COLUMNS``, uint8 (height, width, 3); black where there is none."""
+    """Return observations, uint8 (n, H, W, C), in rows of ``COLUMNS``: uint8 (height, width, 3), padded with black."""
     shown = coloured(observations)
     missing = -len(shown) % COLUMNS
     padded = np.pad(shown, ((0, missing), (GAP, GAP), (GAP, GAP), (0, 0)))

@@ -135,8 +135,8 @@ def test_what_is_given_to_all_commands(tmp_path: Path) -> None:
     """Where a command does not say otherwise: device and preset of stages that have them, settings by stage."""
     path = tmp_path / "own.toml"
     path.write_text(TOML.replace("--layout-seed {layout}", "--layout-seed {layout} --steps 9 --device cpu"))
-    given = ["train-ensemble.steps=3", "train-meta.steps=4"]
-    data, ensemble, *_, agent = cells_of(str(path), *given, "evaluate=false", device="cuda", preset="paper")
+    given = ["train-ensemble.steps=3", "evaluate=false"]
+    data, ensemble, *_, agent = cells_of(str(path), *given, device="cuda", preset="paper")
     assert data.words[-2:] == ["--preset", "paper"]
     assert ensemble.words[-6:] == ["--preset", "paper", "--device", "cuda", "--set", "steps=3"]
     assert agent.words[-2:] == ["--preset", "paper"]
@@ -188,7 +188,7 @@ def settings(cell: Cell) -> dict[str, str]:
 def test_what_all_cells_are_given_undoes_no_method() -> None:
     """Spec F1: the single CNN has one member, whatever --set train-ensemble.KEY says."""
     common = [f"train-ensemble.{pair}" for pair in ("members=3", "diversity=none", "batch_size=8")]
-    changes = ["groups=1", "ladders=1L", "option_groups=1", "train-options.start=2-6"]
+    changes = ["groups=1", "ladders=1L", "option_groups=1"]
     cells = cells_of("montezuma-ladders", *changes, *common, "train-options.termination=learned")
     for cell in cells:
         has = settings(cell)
@@ -199,6 +199,15 @@ def test_what_all_cells_are_given_undoes_no_method() -> None:
     options = [settings(cell) for cell in cells if cell.stage == "train-options"]
     assert {has["start"] for has in options} == {"1L"}
     assert [has["termination"] for has in options].count("oracle") == 1
+
+
+def test_a_setting_that_no_command_would_take_is_refused() -> None:
+    """In rooms every agent has its steps and every ensemble its members; a setting that some take is no fault."""
+    for assignment in ("train-meta.steps=5000", "train-ensemble.members=7"):
+        with pytest.raises(UserError, match="has a value of its own"):
+            cells_of("rooms", assignment)
+    cells_of("rooms", "train-meta.steps=1000")
+    cells_of("figure6", "train-ensemble.diversity_weight=1")
 
 
 def test_controls_and_baselines_keep_the_agents_budget() -> None:

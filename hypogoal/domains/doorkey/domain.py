@@ -45,12 +45,12 @@ class DoorKeyConfig(Config):
 
 
 def _make_grid(layout_seed: int) -> env.GridLayout:
-    """A layout without its agent: those with the same grid have the same states."""
+    """Return a layout without its agent. Layouts with the same grid have the same states."""
     return replace(env.make_layout(layout_seed), start=0, direction=0)
 
 
 def _heldout_seeds(config: DoorKeyConfig) -> list[int]:
-    """The first layout seeds from ``heldout_first`` on whose grids are new."""
+    """Return the first layout seeds from ``heldout_first`` on whose grids are new."""
     grids = set(map(_make_grid, (config.labelled_seed, *config.unlabelled_seeds)))
     chosen: list[int] = []
     layout_seed = config.heldout_first
@@ -64,7 +64,7 @@ def _heldout_seeds(config: DoorKeyConfig) -> list[int]:
 
 
 def _sweep(config: DoorKeyConfig, layout_seeds: Iterable[int], progress: Any) -> States:
-    """All states of the layouts that an expert can reach: images, labels and origins."""
+    """Return all states of the layouts that the expert reaches, with images, labels and origins."""
     swept = []
     for layout_seed in layout_seeds:
         engine = DoorKeyEngine(layout_seed, door_label=config.door_label, wrong_key=config.wrong_key)
@@ -91,16 +91,16 @@ class DoorKeyDomain(Domain[DoorKeyConfig]):
     )
 
     def collect(self, config: DoorKeyConfig, seed: int, progress: Any) -> Collected:
-        """Labelled, unlabelled and held-out states, each with its origin.
+        """Collect labelled, unlabelled and held-out states, each with its origin.
 
-        The scripted expert is an exhaustive breadth-first sweep: every position and direction at every stage of the
-        task (keys held; door locked, open, closed again) that is reachable without dropping a key, each image once.
-        Held-out states that look like a training state are left out: with its keys picked up, a layout can look like
-        another.
+        The scripted expert is an exhaustive breadth-first sweep, which never drops a key. The sweep reaches every
+        position and direction at every stage of the task (which keys are held, and whether the door is locked, open or
+        closed again). Each image of a layout is taken once. Held-out states that look like a training state are left
+        out, because a layout whose keys are picked up can look like another layout.
 
-        Nothing is random, so ``seed`` changes nothing. All three sets have labels (the unlabelled states' are for tests
-        only). Origins, int64 (N,) each: layout_seed and those of ``DoorKeyEngine.origins``. A sub-goal with one class
-        only among the labelled states is a ``UserError``.
+        Nothing is random, so ``seed`` changes nothing. All three sets have labels, but those of the unlabelled states
+        are for tests only. Origins are layout_seed and those of ``DoorKeyEngine.origins``, int64 (N,) each. Raises
+        ``UserError`` if the labelled states are of one class only for a sub-goal.
         """
         heldout_seeds = _heldout_seeds(config)
         progress.total = 1 + len(config.unlabelled_seeds) + len(heldout_seeds)

@@ -1,11 +1,11 @@
-"""The fast DoorKey engine for training. Read ``env`` first, which has the rules; tests compare the two step by step.
+"""The fast DoorKey engine for training. Read ``env`` first, which has the rules. Tests compare the two step by step.
 
-Drawing is 99 % of MiniGrid's cost. Here a step is a few table look-ups for all environments together, and an image is
-eight strips, rows of cells, of which few differ: each is drawn once.
+Drawing is 99 % of MiniGrid's cost. In this engine a step is a few table look-ups for all environments together. An
+image is eight strips, which are rows of cells. Few strips differ, so each strip is drawn once.
 
 A state is a *configuration* (the layout, its door and where its three keys are) and a *pose* (the agent's cell and
-direction). Turning and walking change the pose only and are table look-ups in NumPy. Picking up, dropping and
-toggling change the configuration; they are rare, so plain Python computes them. Every state reached gets an id.
+direction). Turning and walking change the pose only, by table look-ups in NumPy. Picking up, dropping and toggling
+change the configuration. Such changes are rare, so plain Python computes them. Every state reached gets an id.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,13 +33,13 @@ from hypogoal.domains.tiles import TILE, draw_tiles
 
 N_ACTIONS = len(Actions)
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = map(int, Actions)
-SEARCHED = np.delete(np.arange(N_ACTIONS), DROP)  # in the search for reachable states
+SEARCHED = np.delete(np.arange(N_ACTIONS), DROP)  # the actions tried in the search for reachable states
 CELLS = SIZE * SIZE
 POSES = CELLS * 4  # pose = cell * 4 + direction; a power of two
-HELD = CELLS  # a key's place: its cell, or HELD + rank on the ring (rank 0 was picked up first)
+HELD = CELLS  # a key's place is its cell, or HELD + its rank on the ring, where rank 0 was picked up first
 KEY_BITS = np.array([1, 2, 4])  # of the blue, the green and the red key
-OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers
-START = 0  # the id of the start state; with several layouts, of the first one played
+OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers for a door
+START = 0  # the id of the start state; with several layouts, of the start state of the first layout played
 UNKNOWN = -1
 
 # One byte per cell encodes its picture.
@@ -53,12 +53,12 @@ AGENT_ON[EMPTY] = AGENT  # plus the direction
 AGENT_ON[DOOR + OPEN] = AGENT + 4
 AGENT_ON[GOAL] = AGENT + 8
 
-# MiniGrid's rules as tables, read flat: one index into a table is several times faster than two.
+# MiniGrid's rules as tables. They are read flat, because one index into a table is several times faster than two.
 _POSE = np.arange(POSES)
 _CELL, _DIRECTION = np.divmod(_POSE, 4)
-_ONE_ON = np.array((1, SIZE, -1, -SIZE))  # from a cell to the next, by direction
+_ONE_ON = np.array((1, SIZE, -1, -SIZE))  # what to add to a cell to get the next cell, by direction
 AHEAD = np.clip(_CELL + _ONE_ON[_DIRECTION], 0, CELLS - 1)  # the cell in front of each pose
-# For each action, code ahead and pose: what to add to the pose; and may the configuration change?
+# MOVES is what to add to the pose, by action, code ahead and pose. MAY_CHANGE is whether the configuration may change.
 MOVES = np.zeros((N_ACTIONS, N_CODES, POSES), int)
 MOVES[LEFT] = (_DIRECTION - 1) % 4 - _DIRECTION
 MOVES[RIGHT] = (_DIRECTION + 1) % 4 - _DIRECTION
@@ -67,8 +67,8 @@ MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), bool)
 MAY_CHANGE[PICKUP, KEY : KEY + 3] = True
 MAY_CHANGE[DROP, EMPTY] = True
 MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
-STRIP = SIZE * TILE * TILE * 3  # bytes of a row of cells in an image, one after another
-# The engine's tables that grow: a row for each state, or for each configuration.
+STRIP = SIZE * TILE * TILE * 3  # bytes of a strip, which is a row of cells in an image
+# The engine's tables that grow. They have a row for each state, or for each configuration.
 PER_STATE = (
     "_site",
     "_ahead",
@@ -83,12 +83,12 @@ PER_CONFIGURATION = (
     "_id_at",
 )
 
-Configuration = tuple[int, ...]  # the layout's seed; the door; the places of the blue, the green and the red key
+Configuration = tuple[int, ...]  # the layout's seed, the door, and the places of the blue, the green and the red key
 
 
 @cache
 def tiles() -> Bytes:
-    """MiniGrid's picture of each cell code, uint8 (N_CODES, 8, 8, 3)."""
+    """Draw MiniGrid's picture of each cell code, uint8 (N_CODES, 8, 8, 3)."""
     goal, open_door = Goal(), Door(DOOR_COLOUR, is_open=True)
     keys = [Key(colour) for colour in KEY_COLOURS]
     doors = [open_door, Door(DOOR_COLOUR), Door(DOOR_COLOUR, is_locked=True)]
@@ -100,10 +100,10 @@ def tiles() -> Bytes:
 
 
 class DoorKeyEngine(Engine):
-    """Many environments of one layout or several, stepped together; ids are stable, the start state has START.
+    """Many environments of one layout or several, stepped together. Ids never change, and the start state has START.
 
-    Arguments as for ``DoorKeyEnv``, except ``layouts``, a layout's seed or those to begin episodes in, and ``count``,
-    the number of environments.
+    The arguments are those of ``DoorKeyEnv``, except ``count``, the number of environments, and ``layouts``, a layout's
+    seed or the layouts to begin episodes in.
     """
 
     n_actions = N_ACTIONS
@@ -125,12 +125,12 @@ class DoorKeyEngine(Engine):
         self.harsh = wrong_key == "ends"
         self.layouts: Layouts = layouts if isinstance(layouts, Layouts) else Layouts((layouts,))
         self._numbers: dict[Configuration, int] = {}
-        # For each configuration: itself; its cell codes without the agent; ids by pose.
+        # Rows by configuration: the configuration itself, its cell codes without the agent, and ids by pose.
         self._configurations = np.zeros((16, 5), int)
         self._bare_codes = np.zeros((16, CELLS), np.uint8)
         self._id_at = np.full((16, POSES), UNKNOWN, int)
-        # For each id: configuration * POSES + pose; the index of the cell ahead in the bare codes; cell codes; the
-        # strips of its image, once it was asked for; whether the agent is on the goal; whether the episode ends.
+        # Rows by id: configuration * POSES + pose, the index of the cell ahead in the bare codes, the cell codes, the
+        # strips of the image once it was asked for, whether the agent is on the goal, and whether the episode ends.
         self._site = np.zeros(256, int)
         self._ahead = np.zeros(256, int)
         self._codes = np.zeros((256, CELLS), np.uint8)
@@ -138,7 +138,7 @@ class DoorKeyEngine(Engine):
         self._on_goal = np.zeros(256, bool)
         self._final = np.zeros(256, bool)
         self._drawn = np.zeros((256, STRIP), np.uint8)
-        self._strip_of: dict[int, int] = {}  # by the row's codes as one number
+        self._strip_of: dict[int, int] = {}  # the number of a strip, by its eight cell codes as one number
         self.reset()
 
     @property
@@ -150,7 +150,7 @@ class DoorKeyEngine(Engine):
         return self._find_start(seed)
 
     def _find_start(self, seed: int) -> int:
-        """The start state of a layout."""
+        """Return the start state of a layout."""
         layout = make_layout(seed)
         configuration = self._enter_configuration((seed, LOCKED, *layout.keys))
         pose = layout.start * 4 + layout.direction
@@ -170,7 +170,7 @@ class DoorKeyEngine(Engine):
         return Step(following, rewards, terminated, truncated)
 
     def follow(self, ids: Ints, actions: Ints) -> Ints:
-        """MiniGrid's rules: the next states, int64 (n,), after actions int (n,) of 0 .. 6."""
+        """Return the next states, int64 (n,), by MiniGrid's rules, after actions, int (n,) of 0 .. 6."""
         site = self._site.take(ids)
         pose = site & (POSES - 1)
         ahead = self._ahead.take(ids)
@@ -189,11 +189,11 @@ class DoorKeyEngine(Engine):
         return following
 
     def _change(self, site: int, action: int) -> int:
-        """The configuration after an action that ``MAY_CHANGE`` it: a key picked up or dropped, the door toggled."""
+        """Return the configuration after an action that ``MAY_CHANGE`` it, so a pickup, a drop or a toggle."""
         configuration, pose = divmod(site, POSES)
         seed, door, *keys = self._configurations[configuration].tolist()
         last = max(keys)
-        if action == DROP and last < HELD:  # most drops of a random policy
+        if action == DROP and last < HELD:  # no key is held, as at most drops of a random policy
             return configuration
         front = AHEAD.item(pose)
         has_red_key = keys[-1] >= HELD
@@ -218,7 +218,7 @@ class DoorKeyEngine(Engine):
         return rows.reshape(-1, *OBSERVATION_SHAPE)
 
     def _draw(self, ids: Ints) -> None:
-        """Find these states' strips among those that were drawn, and draw the others."""
+        """Find the strips of states, and draw those strips that were not drawn yet."""
         codes = self.codes(ids).reshape(-1, SIZE)
         keys = codes.view(np.uint64)[:, 0]
         for row, key in enumerate(keys.tolist()):
@@ -232,15 +232,15 @@ class DoorKeyEngine(Engine):
             self._strips[ids[state], place] = self._strip_of[key]
 
     def codes(self, ids: Ints) -> Bytes:
-        """Each state's cell codes, uint8 (n, 64) row by row; with ``tiles()`` they give the whole image."""
+        """Return each state's cell codes, uint8 (n, 64), row by row. With ``tiles()`` they give the whole image."""
         return self._codes.take(ids, axis=0)
 
     def at_goal(self, ids: Ints) -> Bools:
-        """Whether the agent is on the goal, bool (n,)."""
+        """Return whether the agent is on the goal, bool (n,)."""
         return self._on_goal.take(ids)
 
     def labels(self, ids: Ints) -> Bools:
-        """True sub-goal predicates, bool (n, G) in the order of ``SUB_GOALS``."""
+        """Return whether each sub-goal truly holds, bool (n, G), in the order of ``SUB_GOALS``."""
         configurations = self._configurations[self._site.take(ids) // POSES]
         door_open = configurations[:, 1] == OPEN
         held = configurations[:, 2:] >= HELD
@@ -255,10 +255,10 @@ class DoorKeyEngine(Engine):
         )
 
     def origins(self, ids: Ints) -> dict[str, Ints]:
-        """The states' origins: agent_x, agent_y, direction, door_state, keys_held; int64 (n,) each.
+        """Return the states' origins agent_x, agent_y, direction, door_state and keys_held, int64 (n,) each.
 
-        ``door_state`` is MiniGrid's (0 open, 1 closed, 2 locked); ``keys_held`` has bit 0 for the blue, 1 for
-        the green, 2 for the red key.
+        ``door_state`` is MiniGrid's (0 open, 1 closed, 2 locked). ``keys_held`` has bit 0 for the blue key, bit 1 for
+        the green key, and bit 2 for the red key.
         """
         number, pose = np.divmod(self._site.take(ids), POSES)
         cell, direction = np.divmod(pose, 4)
@@ -274,11 +274,11 @@ class DoorKeyEngine(Engine):
     def search(self, starts: Ints | None = None) -> tuple[Ints, Ints, Ints]:
         """Search breadth-first for all states reachable from ``starts``, ids (n,), by default those of all layouts.
 
-        Returns their ids, nearest first, int64 (N,); the steps to each, int64 (N,); and the states after each action of
-        ``SEARCHED``, int64 (N, A).
+        Returns the states' ids, nearest first, int64 (N,); the steps to each state, int64 (N,); and the states after
+        each action of ``SEARCHED``, int64 (N, A).
 
-        The search stops at states in which the episode ends: these follow themselves. It never drops a key: that leaves
-        a few thousand states per layout instead of some ten million.
+        The search stops at states in which the episode ends, and every action is taken to lead back to such a state.
+        The search never drops a key, which leaves a few thousand states per layout instead of some ten million.
         """
         if starts is None:
             starts = self._find_starts(self.layouts.seeds)
@@ -296,7 +296,7 @@ class DoorKeyEngine(Engine):
             following[going_on] = reached.reshape(origin.shape)
             rings.append(frontier)
             ways.append(following)
-            seen.resize(self.n_states, refcheck=False)  # with False for new states
+            seen.resize(self.n_states, refcheck=False)  # new states get False
             nearest = np.unique(reached)
             frontier = nearest[~seen[nearest]]
             seen[frontier] = True
@@ -304,9 +304,9 @@ class DoorKeyEngine(Engine):
         return np.concatenate(rings), steps, np.concatenate(ways)
 
     def reachable(self) -> Ints:
-        """Ids of all states reachable from the start, nearest first, one for each image.
+        """Return the ids of all states reachable from the start, nearest first, one for each image.
 
-        States that differ only in the order of the keys on the ring look the same; the first represents them all.
+        States that differ only in the order of the keys on the ring look the same. The first state stands for all.
         """
         ids, *_ = self.search()
         codes = self.codes(ids)
@@ -315,7 +315,7 @@ class DoorKeyEngine(Engine):
         return ids[np.sort(first)]
 
     def plan(self, starts: Ints | None = None) -> Plan:
-        """The transitions between all states, except some ten million that only dropping a key leads to."""
+        """Return the transitions between all states, except some ten million to which only dropping a key leads."""
         ids, _, following = self.search(starts)
         return Plan(
             ids,
@@ -326,7 +326,11 @@ class DoorKeyEngine(Engine):
         )
 
     def shortest_path(self) -> int | None:
-        """The fewest primitive steps to the goal; None with several layouts, or if only a wrong key clears the way."""
+        """Return the fewest primitive steps to the goal.
+
+        The result is None with several layouts, or if the way is free only once a wrong key, which ends the episode, is
+        picked up.
+        """
         if self.layouts.many:
             return None
         ids, steps, _ = self.search()
@@ -334,7 +338,7 @@ class DoorKeyEngine(Engine):
         return int(to_goal.min()) if len(to_goal) else None
 
     def random_success(self, episodes: int, rng: Generator) -> float:
-        """The share of ``episodes`` of uniform-random actions that reach the goal within ``max_steps``."""
+        """Return the share of ``episodes`` of uniformly random actions that reach the goal within ``max_steps``."""
         seeds = rng.choice(self.layouts.seeds, episodes)
         ids = self._find_starts(seeds.tolist())
         solved = 0
@@ -346,7 +350,7 @@ class DoorKeyEngine(Engine):
         return solved / episodes
 
     def snapshot(self) -> dict[str, Any]:
-        """All that a resumed run needs: each environment's state, and the ids assigned so far."""
+        """Return all that a resumed run needs: each environment's state, and the ids assigned so far."""
         return {
             **super().snapshot(),
             "configurations": self._configurations[: len(self._numbers)].copy(),
@@ -354,7 +358,7 @@ class DoorKeyEngine(Engine):
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments; call it before the first step."""
+        """Continue from a ``snapshot`` of an engine made with the same arguments. Call this before the first step."""
         for configuration in snapshot["configurations"].tolist():
             self._enter_configuration(tuple(configuration))
         for site in snapshot["sites"].tolist():
@@ -362,7 +366,7 @@ class DoorKeyEngine(Engine):
         super().restore(snapshot)
 
     def _enter_state(self, site: int) -> int:
-        """The id of a state, a new one if it has none."""
+        """Return the id of a state. If the state has none, it gets a new id."""
         state = self._id_at.item(site)
         if state != UNKNOWN:
             return state
@@ -387,7 +391,7 @@ class DoorKeyEngine(Engine):
         return new
 
     def _enter_configuration(self, configuration: Configuration) -> int:
-        """The number of a configuration, a new one if it has none."""
+        """Return the number of a configuration. If the configuration has none, it gets a new number."""
         number = self._numbers.get(configuration)
         if number is not None:
             return number
@@ -396,7 +400,7 @@ class DoorKeyEngine(Engine):
             self._double(PER_CONFIGURATION)
         seed, door, *keys = configuration
         layout = make_layout(seed)
-        row = bytearray(CELLS)  # faster than an array
+        row = bytearray(CELLS)  # because an array is slower
         for cell in layout.walls:
             row[cell] = WALL
         row[layout.goal] = GOAL
@@ -409,12 +413,12 @@ class DoorKeyEngine(Engine):
         return new
 
     def _double(self, names: Sequence[str]) -> None:
-        """Double the rows of these tables."""
+        """Double the number of rows of the tables ``names``."""
         for name in names:
             setattr(self, name, lengthen(getattr(self, name)))
 
 
 def lengthen(table: Array) -> Array:
-    """The table with twice as many rows; integers in the new ones are ``UNKNOWN``, bytes 0."""
+    """Return the table with twice as many rows. Integers in new rows are ``UNKNOWN``, and other values are 0."""
     filling = UNKNOWN if table.dtype == int else 0
     return np.concatenate([table, np.full_like(table, filling)])

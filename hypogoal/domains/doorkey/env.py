@@ -1,6 +1,7 @@
-"""Three-key DoorKey on minigrid's own classes, its layouts and its five sub-goals.
+"""Three-key DoorKey on minigrid's own classes, with its layouts and its five sub-goals.
 
-This is the reference: the fast engine (``engine.py``) is tested to be pixel- and step-exact with it.
+This environment is the reference. Tests compare the fast engine (``engine.py``) with it pixel by pixel and step by
+step.
 """
 
 from dataclasses import dataclass
@@ -37,10 +38,10 @@ def judge_sub_goals(
     on_goal: Bools | bool,
     door_label: str,
 ) -> Bools:
-    """The five true predicates, bool (..., 5), in the order of ``SUB_GOALS``.
+    """Return whether each of the five sub-goals truly holds, bool (..., 5), in the order of ``SUB_GOALS``.
 
-    ``held`` (..., 3) covers the blue, the green and the red key; the others are (...,). ``open-red-door`` holds when
-    the door is ``open``, wherever the agent stands, or only when the agent is also ``in-front``, facing it.
+    ``held`` (..., 3) is for the blue, the green and the red key. The other arrays are (...,). With ``door_label`` open,
+    ``open-red-door`` holds whenever the door is open. With in-front, the agent must also face the door.
 
     Source: the paper's text (``in-front``), its authors' check (``open``).
     """
@@ -50,7 +51,7 @@ def judge_sub_goals(
 
 @dataclass(frozen=True)
 class GridLayout:
-    """One 8x8 layout. Cells are numbered row by row: cell = y * 8 + x."""
+    """A layout of 8 x 8 cells. Cells are numbered row by row, so cell = y * 8 + x."""
 
     walls: frozenset[int]  # cells, without the door's
     door: int
@@ -61,16 +62,16 @@ class GridLayout:
 
 
 def number_cell(place: Any) -> int:
-    """The cell at a place x, y."""
+    """Return the number of the cell at a place x, y."""
     x, y = place
     return int(y) * SIZE + int(x)
 
 
 class _RingDoor(Door):
-    """MiniGrid's door, opened by any held key of its colour instead of only the one in the hand."""
+    """MiniGrid's door, but any held key of its colour opens it, not only the key in the hand."""
 
     def toggle(self, env: Any, pos: tuple[int, int]) -> bool:
-        """Unlock and open with a held key; an unlocked door opens and closes and never locks again."""
+        """Unlock and open the door with a held key. An unlocked door opens and closes, and never locks again."""
         if self.is_locked:
             if self.color not in env.held:
                 return False
@@ -80,15 +81,15 @@ class _RingDoor(Door):
 
 
 class DoorKeyGrid(MiniGridEnv):
-    """Three-key DoorKey with MiniGrid's dictionary observations; ``DoorKeyEnv`` returns the image instead.
+    """Three-key DoorKey with MiniGrid's dictionary observations. ``DoorKeyEnv`` returns the image instead.
 
-    Pickup puts a key onto a ring and drop takes the last one off, as in the authors' fork.
+    Pickup puts a key onto a ring, and drop takes the last key off the ring, as in the authors' fork.
 
     Args:
-        max_steps: steps after which an episode is truncated.
-        layout_seed: the layout of every episode; None, the layout follows from ``reset(seed)``.
-            ``layout_seed=s`` is the layout of ``reset(seed=s)``.
-        door_label: definition of ``open-red-door`` in ``info["labels"]``, see ``judge_sub_goals``.
+        max_steps: the number of steps after which an episode is truncated.
+        layout_seed: the layout of every episode. None: the layout follows from ``reset(seed)``. ``layout_seed=s`` is
+            the layout of ``reset(seed=s)``.
+        door_label: the definition of ``open-red-door`` in ``info["labels"]``, see ``judge_sub_goals``.
         wrong_key: whether an episode ``ends`` (terminated, reward 0) once the blue or the green key is held.
     """
 
@@ -113,7 +114,7 @@ class DoorKeyGrid(MiniGridEnv):
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Colours of the keys held, the last picked up last."""
+        """The colours of the keys held, in the order in which they were picked up."""
         return tuple(key.color for key in self.ring)
 
     def _gen_grid(self, width: int, height: int) -> None:
@@ -146,16 +147,16 @@ class DoorKeyGrid(MiniGridEnv):
         self._np_random = episode_rng
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """A new episode; ``info["labels"]`` has the true sub-goal predicates."""
+        """Begin a new episode. ``info["labels"]`` says which sub-goals truly hold."""
         observation, info = super().reset(seed=seed, options=options)
         return observation, info | {"labels": self._named_labels()}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """MiniGrid's step with a key ring; reward 1 at the goal, else 0."""
+        """Step as MiniGrid does, but with a key ring. The reward is 1 at the goal, and 0 elsewhere."""
         played = action
         if action in (self.actions.pickup, self.actions.drop):
             self._use_ring(pick_up=action == self.actions.pickup)
-            played = self.actions.done  # MiniGrid only counts the step and observes
+            played = self.actions.done  # an action at which MiniGrid only counts the step and observes
         observation, reward, terminated, truncated, info = super().step(played)
         wrong = self.wrong_key == "ends" and not {*self.held} <= {DOOR_COLOUR}
         return observation, float(reward), terminated or wrong, truncated, info | {"labels": self._named_labels()}
@@ -170,13 +171,13 @@ class DoorKeyGrid(MiniGridEnv):
         elif not pick_up and cell is None and ring:
             self.grid.set(x, y, ring.pop())
         hand: Any = ring[-1] if ring else None
-        self.carrying = hand  # MiniGrid's own view shows it
+        self.carrying = hand  # which MiniGrid's own view shows
 
     def _reward(self) -> float:
         return 1.0
 
     def labels(self) -> Bools:
-        """The true predicates of the current state, bool (5,), in the order of ``SUB_GOALS``."""
+        """Return whether each sub-goal truly holds in the current state, bool (5,), in the order of ``SUB_GOALS``."""
         held = np.array([colour in self.held for colour in KEY_COLOURS])
         return judge_sub_goals(
             held,
@@ -193,8 +194,8 @@ class DoorKeyGrid(MiniGridEnv):
 class DoorKeyEnv(DoorKeyGrid):
     """Three-key DoorKey, observed as the full RGB image, uint8 (64, 64, 3), without a view cone.
 
-    Gymnasium id ``hypogoal/DoorKey-8x8-v0``; seven actions: left, right, forward, pickup, drop, toggle, done.
-    Arguments as ``DoorKeyGrid``.
+    The Gymnasium id is ``hypogoal/DoorKey-8x8-v0``. The seven actions are left, right, forward, pickup, drop, toggle
+    and done. The arguments are those of ``DoorKeyGrid``.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -202,14 +203,14 @@ class DoorKeyEnv(DoorKeyGrid):
         self.observation_space = spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
 
     def gen_obs(self) -> Bytes:
-        """What MiniGrid's ``RGBImgObsWrapper(tile_size=8)`` draws when the view cone is not tinted."""
+        """Draw what MiniGrid's ``RGBImgObsWrapper(tile_size=8)`` draws if the view cone is not tinted."""
         x, y = self.agent_pos
         return self.grid.render(TILE, (x, y), self.agent_dir)
 
 
 @cache
 def make_layout(layout_seed: int) -> GridLayout:
-    """The layout of ``DoorKeyEnv(layout_seed=layout_seed)``."""
+    """Return the layout of ``DoorKeyEnv(layout_seed=layout_seed)``."""
     env = DoorKeyGrid(layout_seed=layout_seed)
     env.reset()
     return env.layout

@@ -16,12 +16,12 @@ from hypogoal.domains.gymnasium.reader import Reader, reader_of
 from hypogoal.observations import DType, Shape
 
 Make = Callable[..., gymnasium.Env]
-TRAINING = "training"  # the split that is played after collection
+TRAINING = "training"  # the split that later stages play
 SPLITS = tuple(name.removesuffix("_seeds") for name in SEEDS)
 
 
 class GymnasiumConfig(Config):
-    """Settings of ``hypogoal collect`` for such a domain."""
+    """Settings of ``hypogoal collect`` for a domain made of a Gymnasium environment."""
 
     labelled_seeds: tuple[int, ...] = setting(
         (0,), "layout seeds of the labelled states", source="as the paper's MiniGrid experiment", low=0
@@ -44,32 +44,33 @@ class GymnasiumConfig(Config):
 
 
 class GymnasiumDomain(Domain[GymnasiumConfig]):
-    """All that hypogoal needs to know about a problem, from a Gymnasium environment.
+    """A domain made of a Gymnasium environment.
 
     Args:
-        make: makes an environment; or functions that do, by split: ``training``, and any of ``labelled``,
-            ``unlabelled`` and ``heldout`` that differs from it. Observations are pictures, uint8 (H, W, C) or (H, W),
-            or numbers, a ``Box`` of any shape or a ``Dict`` of such; actions are ``Discrete``. The ``seed`` of
-            ``reset`` sets the layout: the same seed and actions give the same episode. Arguments of ``make`` are the
-            domain's own settings, see ``config_class``.
-        sub_goals: by name, a function of the environment that returns whether the sub-goal holds in its current state,
+        make: a function that makes an environment, or functions by split. The splits are ``training``, and any of
+            ``labelled``, ``unlabelled`` and ``heldout`` that differs from it. Observations are pictures, uint8
+            (H, W, C) or (H, W), or numbers, a ``Box`` of any shape, or a ``Dict`` of pictures and numbers. Actions are
+            ``Discrete``. The ``seed`` of ``reset`` sets the layout, so the same seed and actions give the same episode.
+            Arguments of ``make`` are the domain's own settings, see ``config_class``.
+        sub_goals: by name, a function of the environment that returns whether the sub-goal holds in the current state,
             whatever came before.
-        success: called at the end of each training episode, returns whether it was a success: a function of the
-            environment, the last step's info, the episode's sum of rewards, and whether it terminated. None: an episode
-            succeeds when it terminates with a sum above 0.
-        policy: plays ``1 - explore`` of the steps to collect states; None: random play. Policies by sub-goal, for
-            example one that reaches each rare sub-goal, share the steps evenly.
+        success: a function that is called at the end of each training episode, and returns whether the episode was a
+            success. Its arguments are the environment, the last step's info, the episode's sum of rewards, and whether
+            the episode terminated. None: an episode succeeds if it terminates with a sum of rewards above 0.
+        policy: a function that plays ``1 - explore`` of the steps in which states are collected. None: play is random.
+            Policies by sub-goal, for example a policy for each rare sub-goal, share the steps evenly.
         origins: by name, functions of the environment that return numbers to keep beside each state. A name that begins
-            with ``planted_`` is of a feature, which holds or not: evaluation says how well members tell it, and
-            labelled and held-out states are drawn evenly over combinations of features, too.
-        plan: options can be planned (``network=planned``): every layout is walked through before. True: observations
-            and labels identify a state of a layout; or a function of the environment that returns what they hide, such
-            as the agent's place. The environment must be deterministic, with at most some 50,000 states.
-        defaults: by stage, settings that suit this domain: ``{"train-ensemble": {"network": "montezuma"}}``.
+            with ``planted_`` is that of a feature, which holds or not. Evaluation says how well members tell the
+            feature, and labelled and held-out states are drawn evenly over combinations of features, too.
+        plan: whether options can be planned (``network=planned``), for which every layout is walked through first.
+            True: observations and labels identify a state of a layout. If observations hide something, such as the
+            agent's place, give a function of the environment that returns what is hidden. The environment must be
+            deterministic, with at most some 50,000 states.
+        defaults: by stage, settings that suit this domain, such as ``{"train-ensemble": {"network": "montezuma"}}``.
         memory: the number of distinct states whose observations training keeps, see ``GymnasiumEngine``.
-        name: for messages; artefacts use the name that the user passed to ``collect``.
-        config_class: a class derived from ``GymnasiumConfig`` that adds settings; ``make`` gets them in collection,
-            training, baselines and evaluation.
+        name: the domain's name in messages. Artefacts use the name that the user passed to ``collect``.
+        config_class: a class derived from ``GymnasiumConfig`` that adds settings. ``make`` gets the added settings in
+            collection, training, baselines and evaluation.
 
     Example, for ``hypogoal collect my_module:DOMAIN``::
 
@@ -108,7 +109,7 @@ class GymnasiumDomain(Domain[GymnasiumConfig]):
 
     @cached_property
     def reader(self) -> Reader:
-        """Reads its observations."""
+        """The reader of the environment's observations."""
         env = self.make_env()
         reader = reader_of(env.observation_space)
         env.close()
@@ -123,9 +124,10 @@ class GymnasiumDomain(Domain[GymnasiumConfig]):
         return self.reader.dtype
 
     def make_env(self, split: str = TRAINING, **arguments: Any) -> gymnasium.Env[Any, Any]:
-        """An environment of a split; ``arguments``: the domain's own settings, defaults for those left out.
+        """Return an environment of a split.
 
-        One whose actions are not ``Discrete`` is a ``UserError``.
+        ``arguments`` are the domain's own settings. Missing settings have their defaults. Raises ``UserError`` if the
+        environment's actions are not ``Discrete``.
         """
         fields = self.config_class.model_fields
         defaults = {name: fields[name].default for name in self.engine_settings}
@@ -137,6 +139,9 @@ class GymnasiumDomain(Domain[GymnasiumConfig]):
         return env
 
     def make_engine(self, layout_seed: int, count: int, max_steps: int, **arguments: Any) -> GymnasiumEngine:
-        """An engine of ``count`` environments; ``arguments``: ``layouts``, ``memory`` and the domain's own settings."""
+        """Return an engine of ``count`` environments.
+
+        ``arguments`` are ``layouts``, ``memory`` and the domain's own settings.
+        """
         layouts = arguments.pop("layouts", Layouts((layout_seed,)))
         return GymnasiumEngine(self, layouts, count, max_steps=max_steps, **{"memory": self.memory} | arguments)

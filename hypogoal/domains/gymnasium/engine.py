@@ -1,4 +1,4 @@
-"""Any Gymnasium environment as an engine: many copies stepped in turn, states by id, each distinct one kept once."""
+"""An engine of copies of any Gymnasium environment, which are stepped in turn. Each distinct state is kept once."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ if TYPE_CHECKING:
 
 Label = Callable[[gymnasium.Env], bool]
 Success = Callable[[gymnasium.Env, dict[str, Any], float, bool], bool]
-MEMORY = 110_000  # the replay's 1e5 transitions and those not yet in it
+MEMORY = 110_000  # states, for the replay's 1e5 transitions and those that are not yet in the replay
 
 
 def ask_labels(env: gymnasium.Env, functions: Mapping[str, Label]) -> Bools:
-    """Which sub-goals hold in an environment's state, bool (G,), by a function each; ``UserError`` if one is unsure."""
+    """Return which sub-goals hold in an environment's state, bool (G,), by a function for each.
+
+    Raises ``UserError`` if a function returns no truth value.
+    """
     labels = []
     for name, function in functions.items():
         holds = function(env)
@@ -39,16 +42,17 @@ def ask_labels(env: gymnasium.Env, functions: Mapping[str, Label]) -> Bools:
 
 
 class GymnasiumEngine(TurnEngine):
-    """Environments of one layout or several, stepped one after the other.
+    """Gymnasium environments of one layout or several, which are stepped one after the other.
 
-    Every episode begins with ``reset(seed=layout_seed)``. An observation and its labels identify a state, in whichever
-    layout: it keeps its id while it is among the newest ``memory`` distinct ones. Twice as many are kept, so that a
-    replay of ``memory`` steps finds its states; older ones are forgotten.
+    Every episode begins with ``reset(seed=layout_seed)``. An observation and its labels identify a state, whatever the
+    layout. A state keeps its id while it is among the newest ``memory`` distinct states. Twice as many states are kept,
+    so that a replay of ``memory`` steps finds its states. Older states are forgotten.
 
-    Where the domain has ``plan``, layout, end and what ``plan`` returns identify a state, too.
+    If the domain has ``plan``, a state is also identified by its layout, by whether it is terminal, and by what
+    ``plan`` returns.
 
-    Episodes are truncated after ``max_steps`` steps, or earlier by the environment. ``success`` is called at the end of
-    each, see ``GymnasiumDomain``.
+    An episode is truncated after ``max_steps`` steps, or earlier by the environment. ``success`` is called at the end
+    of each episode, see ``GymnasiumDomain``.
     """
 
     CHANGING = (*TurnEngine.CHANGING, "_earned", "_played")
@@ -68,17 +72,17 @@ class GymnasiumEngine(TurnEngine):
         self.layouts: Layouts = layouts
         self.memory: int = memory
         self.room = 2 * memory
-        self.width = len(domain.sub_goals) + DIGEST  # the facts are labels, and what identifies the state
+        self.width = len(domain.sub_goals) + DIGEST  # the facts are the labels and the digest that identifies the state
         self._envs = [domain.make_env(**arguments) for _ in range(count)]
         self._walk = Walk(self, domain.make_env(**arguments)) if domain.plan else None
         self._is_planned = False
-        self._earned = [0.0] * count  # in the episode so far
-        self._played: list[list[int]] = [[] for _ in range(count)]  # the episode's actions
+        self._earned = [0.0] * count  # the sum of rewards in the episode so far, by environment
+        self._played: list[list[int]] = [[] for _ in range(count)]  # the actions of the episode so far, by environment
         self.observation_shape = domain.observation_shape
         self.observation_dtype = domain.observation_dtype
         actions: Any = self._envs[0].action_space
         self.n_actions = int(actions.n)
-        self._ids: dict[bytes, int] = {}  # of the states that are kept, by digest, oldest first
+        self._ids: dict[bytes, int] = {}  # ids of the states that are kept, by digest, the oldest first
         self.reset()
 
     def _begin(self, number: int) -> int:
@@ -112,7 +116,7 @@ class GymnasiumEngine(TurnEngine):
         return state, earned, terminated, truncated, succeeded
 
     def remember(self, env: gymnasium.Env, observation: Any, seed: int, terminated: bool = False) -> int:
-        """The id of an environment's current state, in the layout of a seed."""
+        """Return the id of an environment's current state, in the layout of ``seed``. A new state gets an id."""
         domain = self.domain
         image = domain.reader.read(observation)
         labels = ask_labels(env, domain.label_functions)
@@ -128,7 +132,7 @@ class GymnasiumEngine(TurnEngine):
         return state
 
     def plan(self, starts: Ints | None = None) -> Plan | None:
-        """What follows in all states of the layouts, whatever ``starts``; None where the domain has no ``plan``."""
+        """Return what follows in all states of the layouts, whatever ``starts``. None: the domain has no ``plan``."""
         if self._walk is None:
             return None
         if not self._is_planned:
@@ -138,7 +142,7 @@ class GymnasiumEngine(TurnEngine):
         return self._walk.plan()
 
     def _file(self, look: bytes, state: int) -> None:
-        """Enter a digest's newest id, and drop one of a forgotten state where there are more than states."""
+        """Enter a digest's newest id. If there are more digests than kept states, drop that of a forgotten state."""
         self._ids.pop(look, None)
         self._ids[look] = state
         if len(self._ids) > self.room:
@@ -150,13 +154,13 @@ class GymnasiumEngine(TurnEngine):
         return self.read_facts(ids)[:, :labels].view(bool)
 
     def snapshot(self) -> State:
-        """All that a resumed run needs: the states, and the actions played since each episode began."""
+        """Return all that a resumed run needs: the states, and the actions played since each episode began."""
         return super().snapshot() | {"images": np.stack([*self._seen.values()])}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Continue from a ``snapshot`` of an engine made with the same arguments: replays the current episodes.
+        """Continue from a ``snapshot`` of an engine made with the same arguments, by playing its episodes again.
 
-        A ``UserError`` if they lead to other states: the environment is not deterministic.
+        Raises ``UserError`` if the episodes lead to other states, because the environment is not deterministic.
         """
         super().restore(snapshot)
         looks = self.read_facts(self.kept)[:, -DIGEST:]
@@ -168,7 +172,7 @@ class GymnasiumEngine(TurnEngine):
             self._replay(number)
 
     def _replay(self, number: int) -> None:
-        """Play one environment's current episode again."""
+        """Play one environment's current episode again. Raises ``UserError`` if it leads to another state."""
         env = self._envs[number]
         seed = self.layouts.now[number]
         observation, _info = env.reset(seed=seed)

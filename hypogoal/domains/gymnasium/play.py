@@ -1,4 +1,4 @@
-"""States of a Gymnasium environment: play of each layout, and a sample of what it reached."""
+"""How states of a Gymnasium environment are collected, by play of each layout and a sample of the states reached."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Policy = Callable[[gymnasium.Env, Any, Generator], int]
 """How to play when collecting states: (environment, observation, random numbers) -> action."""
-SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # settings: the layouts of each set
+SEEDS = ("labelled_seeds", "unlabelled_seeds", "heldout_seeds")  # the settings that name the layouts of each set
 PASS_SEEDS = (
     "Pass every seed on, also 0: super().reset(seed=seed). No wrapper may show what came before (NormalizeObservation)."
 )
@@ -30,11 +30,11 @@ ORIGINS = ("layout_seed", "episode", "step")
 
 
 class Met(NamedTuple):
-    """A state that was met, and where."""
+    """A state that was met, and where it was met."""
 
     observation: Observations
     labels: Bools
-    origin: tuple[int, ...]  # by ``ORIGINS``, then the domain's own
+    origin: tuple[int, ...]  # the numbers of ``ORIGINS``, then those of the domain's own origins
 
 
 def play_layout(
@@ -44,9 +44,10 @@ def play_layout(
     config: GymnasiumConfig,
     rng: Generator,
 ) -> Iterator[tuple[Any, tuple[int, int, int]]]:
-    """Play a layout: each observation and its origin, also of an episode's last state, since a sub-goal may hold there.
+    """Play a layout. Yield each observation and its origin.
 
-    The policies share the steps; None plays at random.
+    The last state of an episode is yielded, too, because a sub-goal may hold in it. The policies share the steps
+    evenly. None in place of a policy plays at random.
     """
     episode = -1
     for turn, policy in enumerate(policies):
@@ -78,12 +79,12 @@ def sample_layout(
     *,
     by_features: bool,
 ) -> list[Met]:
-    """Distinct states of a layout, except those in ``seen``, digests: an even sample of all combinations of sub-goals,
-    and of features.
+    """Return a sample of the distinct states of a layout, even over combinations of sub-goals, and of features.
 
-    Of each combination at most ``config.states`` are kept, each of those met with the same probability.
+    States whose digests are in ``seen`` are left out. Of each combination at most ``config.states`` states are kept,
+    and each state that was met is kept with the same probability.
     """
-    kept: dict[bytes, list[Met]] = {}  # by labels
+    kept: dict[bytes, list[Met]] = {}  # by combination
     offered: Counter[bytes] = Counter()
     begun = b""
     for observation, origin in play_layout(domain.policies, env, layout_seed, config, rng):
@@ -124,23 +125,24 @@ def sample_layout(
 
 
 def sample_evenly(samples: list[list[Met]], size: int, rng: Generator) -> list[Met]:
-    """Up to ``size`` states of all samples, as evenly as possible, in the order in which they were reached."""
+    """Return up to ``size`` states of all samples, as evenly as possible, in the order in which they were reached."""
     states: list[Met] = []
     samples.sort(key=len)
     for number, sample in enumerate(samples):
         even = (size - len(states)) // (len(samples) - number)
-        # Not the first places: those favour the first states reached, or, in a full sample, exclude the next ones.
+        # The first places of a sample would favour the first states reached, or, in a full sample, exclude states that
+        # were reached later.
         order = rng.permutation(len(sample))
         states += [sample[place] for place in order[:even]]
     return sorted(states, key=lambda state: state.origin)
 
 
 def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progress: Any) -> Collected:
-    """Labelled, unlabelled and held-out states reached in play on each layout, each picture once.
+    """Collect labelled, unlabelled and held-out states by play, each observation of a layout once.
 
-    Held-out states that look like a labelled or unlabelled one are left out. Origins: ``layout_seed``, ``episode``
-    and ``step``, counted from 0, and the domain's own. Raises ``Unmet`` if the labelled states have one class
-    only, or if there are no unlabelled or no held-out states.
+    Held-out states that look like a labelled or unlabelled state are left out. Origins are ``layout_seed``, ``episode``
+    and ``step``, counted from 0, and the domain's own. Raises ``Unmet`` if the labelled states are of one class only
+    for a sub-goal, or if a set has no states.
     """
     world = domain.world(config.model_dump())
     reader = domain.reader
@@ -155,7 +157,7 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
         for layout_seed in seeds:
             seen = set(training) if name == "heldout_seeds" else set()
             rng = rng_for(seed, "play", layout_seed)
-            by_features = name != "unlabelled_seeds"  # nobody knows them there
+            by_features = name != "unlabelled_seeds"  # nobody knows the features of unlabelled states
             met += sample_layout(domain, env, layout_seed, config, seen, rng, by_features=by_features)
             progress.advance()
         env.close()
@@ -168,7 +170,7 @@ def collect(domain: GymnasiumDomain, config: GymnasiumConfig, seed: int, progres
         observations, labels, origins = zip(*met, strict=True)
         named = dict(zip(names, np.transpose(origins), strict=True))
         states = States(
-            np.array([*observations], reader.dtype),  # a tuple would be one mixed observation
+            np.array([*observations], reader.dtype),  # a list, because a tuple would be one mixed observation
             np.array(labels),
             named,
         )

@@ -1,7 +1,7 @@
-"""How observations of a Gymnasium space become arrays: a picture, numbers, or several of both by key.
+"""How observations of a Gymnasium space become arrays, which are pictures, numbers, or mixed.
 
-What is a picture and what numbers, ``hypogoal.domains.observations`` says; several by key are packed into one array of
-a structured type, see ``hypogoal.observations``.
+``hypogoal.domains.observations`` says what is a picture and what are numbers. Several of them by key are packed into
+one array of a structured type, see ``hypogoal.observations``.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ from hypogoal.domains.observations import CLEARLY, reading_of
 from hypogoal.observations import NUMBERS, PICTURE, DType, Shape, mixed_type
 
 Space = spaces.Space[Any]
-COMPARED = (16, 64, 256)  # after so many observations it is asked which of their numbers float32 makes equal:
-KEPT = 0.9  # it must keep this share of the distinct values,
-NOTICED = 1e-6  # or change none by more than this
+# After these numbers of observations, a reader checks that float32 does not make different numbers equal. float32 must
+# keep the share KEPT of the distinct values, or change no value by more than NOTICED.
+COMPARED = (16, 64, 256)
+KEPT = 0.9
+NOTICED = 1e-6
 
 
 @dataclass(frozen=True)
 class Reader:
-    """Reads observations of a space as arrays of one shape and type.
+    """A reader of observations of a space, as arrays of one shape and type.
 
     Attributes:
-        features: the names of numbers, those of a ``Dict`` by its keys.
-        key: of a ``Dict`` that holds nothing but a picture, the picture's.
+        features: the names of the numbers. The numbers of a ``Dict`` are named by its keys.
+        key: the picture's key, for a ``Dict`` of nothing but a picture.
         parts: by key, the readers of a ``Dict`` of pictures and numbers.
-        met: the first observations, where float32 does not hold all their numbers.
+        met: the first observations, if float32 does not hold all their numbers.
     """
 
     space: Space
@@ -45,7 +47,10 @@ class Reader:
     met: list[Any] = field(default_factory=list)
 
     def read(self, observation: Any) -> Any:
-        """A copy (*shape) of an observation; ``UserError`` if it does not fit its space, or its numbers not float32."""
+        """Return a copy (*shape) of an observation.
+
+        Raises ``UserError`` if the observation does not fit its space, or if its numbers do not fit float32.
+        """
         if self.parts:
             mixed = np.empty((), self.dtype)
             for key, part in self.parts.items():
@@ -72,7 +77,7 @@ class Reader:
         return values.reshape(self.shape)
 
     def _require_kept(self, exact: Any, cast: Any) -> None:
-        """Refuse (``UserError``) numbers (D,) that are not finite, or that float32 makes equal."""
+        """Raise ``UserError`` if numbers (D,) are not finite, or if float32 makes different numbers equal."""
         fault, do = "an observation has numbers that are not finite in float32", "Clip or replace them in a wrapper."
         lost = ~np.isfinite(cast)
         if not lost.any() and not np.can_cast(exact.dtype, NUMBERS) and len(self.met) < COMPARED[-1]:
@@ -93,11 +98,11 @@ class Reader:
 
 
 def reader_of(space: Space, key: str = "") -> Reader:
-    """A reader of an observation space, or of what a ``Dict`` has under ``key``.
+    """Return a reader of an observation space, or of the part of a ``Dict`` that is called ``key``.
 
-    A ``Dict`` of pictures and others, each under a key of its own, is read by key, without its text, which a warning
-    names. Other spaces that Gymnasium's ``flatten`` accepts become float32 (D,) in its order. Observations that are
-    neither pictures nor numbers are a ``UserError``.
+    A ``Dict`` of pictures and numbers, each under a key of its own, is read by key. Its text is left out, and a warning
+    names the keys of the text. Other spaces that Gymnasium's ``flatten`` accepts become float32 (D,), in the order of
+    ``flatten``. Raises ``UserError`` if observations are neither pictures nor numbers.
     """
     space, texts = _split(space)
     if texts:
@@ -116,7 +121,10 @@ def reader_of(space: Space, key: str = "") -> Reader:
 
 
 def _split(space: Space) -> tuple[Space, list[str]]:
-    """A space without the text among its entries, and the keys of this; all of it if there is nothing else."""
+    """Return a space without the text among its entries, and the keys of the text.
+
+    If all entries are text, the whole space is returned, and no keys.
+    """
     if not isinstance(space, spaces.Dict):
         return space, []
     texts = [key for key, part in space.items() if str(part.dtype).startswith("<U")]
@@ -126,7 +134,7 @@ def _split(space: Space) -> tuple[Space, list[str]]:
 
 
 def _is_picture(space: Space) -> bool:
-    """Whether this is a picture, or refused because it may be."""
+    """Return whether observations of a space are pictures, or are refused because they may be pictures."""
     if not isinstance(space, spaces.Box):
         return False
     reading = reading_of(space.shape, space.dtype)
@@ -134,7 +142,7 @@ def _is_picture(space: Space) -> bool:
 
 
 def _by_key(space: spaces.Dict) -> Reader:
-    """A reader of a ``Dict`` with pictures; of one alone it is that picture."""
+    """Return a reader of a ``Dict`` with pictures. If the ``Dict`` has one key, the reader is that of the picture."""
     parts = {key: reader_of(part, str(key)) for key, part in space.items()}
     if len(parts) == 1:
         [(key, part)] = parts.items()
@@ -152,7 +160,7 @@ def _by_key(space: spaces.Dict) -> Reader:
 
 
 def _numbers(space: Space, key: str) -> Reader:
-    """A reader of a space without pictures, which Gymnasium flattens."""
+    """Return a reader of a space of numbers, which Gymnasium flattens. Raises ``UserError`` if there are pictures."""
     features = []
     for name, part in _leaves(space, key):
         if _is_picture(part):
@@ -169,7 +177,7 @@ def _numbers(space: Space, key: str) -> Reader:
 
 
 def _leaves(space: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """By name, the spaces in a ``Dict`` or ``Tuple`` in the order of flattening; any other space itself."""
+    """Yield the spaces in a ``Dict`` or ``Tuple`` by name, in the order of flattening, or any other space itself."""
     if not isinstance(space, spaces.Dict | spaces.Tuple):
         yield name, space
         return
@@ -179,9 +187,9 @@ def _leaves(space: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _names(name: str, space: Space) -> list[str]:
-    """The names of a space's numbers."""
+    """Return the names of a space's numbers. Raises ``UserError`` if Gymnasium cannot flatten the space."""
     try:
-        if isinstance(space, spaces.Text):  # Gymnasium numbers its letters otherwise after a space was stored
+        if isinstance(space, spaces.Text):  # once a space was stored, Gymnasium numbers the letters of a text otherwise
             raise ValueError
         size = spaces.flatdim(space)
     except (NotImplementedError, ValueError):
@@ -198,9 +206,10 @@ def _names(name: str, space: Space) -> list[str]:
 
 
 def recorded(space: Space, values: Any, keys: Collection[str] = (), place: str = "") -> dict[str, Any]:
-    """Observations (T, ...) of a space by key, as those of an environment are read; pictures are not yet arranged.
+    """Return recorded observations (T, ...) of a space by key, read as those of an environment are.
 
-    Where there are no pictures, numbers are flattened into one array. Each of ``keys``, if any, is a space of its own.
+    Pictures are not arranged yet. If there are no pictures, numbers are flattened into one array. If there are
+    ``keys``, the space that a key names is read on its own.
     """
     is_wanted = not keys or place in keys
     has_pictures = any(_is_picture(part) for _, part in _leaves(space, place))
@@ -221,5 +230,5 @@ def recorded(space: Space, values: Any, keys: Collection[str] = (), place: str =
 
 
 def _entries(space: Any) -> list[tuple[Any, Any]]:
-    """What a ``Dict`` or ``Tuple`` has, with keys."""
+    """Return the keys and spaces of a ``Dict`` or ``Tuple``."""
     return [*(space.items() if isinstance(space, spaces.Dict) else enumerate(space))]

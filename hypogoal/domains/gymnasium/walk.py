@@ -1,4 +1,4 @@
-"""What follows on each action in each state of a layout, found by walking through the environment itself."""
+"""A walk through an environment, which finds what follows on each action in each state of a layout."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from hypogoal.domains.base import Plan
 if TYPE_CHECKING:
     from hypogoal.domains.gymnasium.engine import GymnasiumEngine
 
-MOST = 50_000  # states that are walked through
+MOST = 50_000  # the most states that are walked through
 UNTRIED = -1
 
 
 class Walk:
-    """Tries every action in every state that episodes reach.
+    """A walk that tries every action in every state that episodes reach.
 
-    It goes the shortest way to an action that was not tried yet, and begins the episode anew where no way leads there.
-    So the environment need not be copied, and what is walked twice shows whether it is deterministic.
+    The walk goes the shortest way to an action that was not tried yet. Where no way leads to such an action, the walk
+    begins an episode anew. So the environment need not be copied, and steps that are walked twice show whether the
+    environment is deterministic.
 
     Attributes:
         engine: gives states their ids.
         env: the environment that is walked through.
-        following: by state, the states after each action; ``UNTRIED`` where no episode lasts long enough.
-        final: states in which the task is over.
-        solved: those where ``success`` says so, by default those reached with a reward.
+        following: by state, the states after each action, or ``UNTRIED`` if no episode lasts long enough.
+        final: the states in which the task is over.
+        solved: the final states in which ``success`` says so, or by default, which were reached with a reward above 0.
     """
 
     def __init__(self, engine: GymnasiumEngine, env: gymnasium.Env):
@@ -38,7 +39,7 @@ class Walk:
         self.solved: set[int] = set()
 
     def through(self, seed: int) -> None:
-        """Walk through a layout; a ``UserError`` if it has too many states or is not deterministic."""
+        """Walk through a layout. Raises ``UserError`` if it has too many states, or is not deterministic."""
         state = self._begin(seed)
         is_start = True
         while True:
@@ -52,14 +53,14 @@ class Walk:
                 left -= 1
                 if is_over:
                     break
-            if is_start and left:  # the episode was cut before it got there, so what is left is too far
+            if is_start and left:  # the episode was cut on the shortest way, so all actions that are left are too far
                 return
             is_start = is_over
             if is_over:
                 state = self._begin(seed)
 
     def way(self, state: int) -> list[int]:
-        """The fewest actions from a state of which the last was never tried; empty if there are none."""
+        """Return the fewest actions from a state of which the last was never tried, or no actions if all were tried."""
         ways: dict[int, list[int]] = {state: []}
         queue = [state]
         for passed in queue:
@@ -73,7 +74,7 @@ class Walk:
         return []
 
     def require(self, state: int, action: int, after: int, seed: int) -> None:
-        """Refuse (``UserError``) a step that led elsewhere before."""
+        """Raise ``UserError`` if the same step led elsewhere before."""
         if self.following[state][action] not in (UNTRIED, after):
             raise UserError(
                 "the same action led from the same state to another one, so this cannot be planned",
@@ -82,7 +83,7 @@ class Walk:
             )
 
     def plan(self) -> Plan:
-        """What follows in all states that were found; after an action that was not tried, the state itself."""
+        """Return what follows in all states that were found. An action that was not tried leads to the state itself."""
         ids = np.array(sorted(self.following))
         following = np.array([self.following[state] for state in ids.tolist()])
         return Plan(
@@ -101,7 +102,7 @@ class Walk:
         return state
 
     def _play(self, state: int, action: int, seed: int) -> tuple[int, bool]:
-        """Take a step: the state reached, and whether the episode is over."""
+        """Take a step. Return the state reached, and whether the episode is over."""
         observation, reward, terminated, cut, info = self.env.step(action)
         last = float(reward)
         self.earned += last
@@ -118,7 +119,7 @@ class Walk:
         return after, bool(terminated or cut)
 
     def _enter(self, state: int, seed: int) -> None:
-        """Enter a state among those that are known; a ``UserError`` if there are too many."""
+        """Enter a state among the known states. Raises ``UserError`` if there are too many."""
         most = min(MOST, self.engine.memory)
         if len(self.following) == most and state not in self.following:
             raise UserError(

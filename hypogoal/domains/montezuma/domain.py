@@ -1,8 +1,8 @@
-"""Sub-goals in Montezuma's Revenge: the domain, and how its states are collected.
+"""The domain of sub-goals in Montezuma's Revenge, and how its states are collected.
 
-See also ``emulator`` (the game, with the agent placed anywhere), ``ladders`` (their positions), ``sub_goals``,
-``expert`` (scripted play), ``states`` (the states of a room), ``env`` and ``engine`` (one game and many, from the top
-of a ladder).
+See also ``emulator`` (the game, with the agent placed anywhere), ``ladders`` (the ladders' positions), ``sub_goals``,
+``expert`` (scripted play), ``states`` (the states of a room), ``env`` (one game from the top of a ladder or elsewhere)
+and ``engine`` (many games).
 """
 
 from collections.abc import Callable, Mapping
@@ -36,7 +36,7 @@ TABLE_1 = {
     "class_weight_negative": 0.8,
     "class_weight_positive": 0.2,
 }
-# What lets options learn on a laptop, alone or under a meta-policy.
+# Settings with which options learn on a laptop, alone or under a meta-policy.
 LEARNING = {
     "option_timeout": MAX_STEPS,
     "experience": "own",
@@ -48,7 +48,7 @@ LEARNING = {
     "epsilon_steps": 10_000,
     "epsilon_final": 0.01,
 }
-# Options learned alone, ladder by ladder.
+# Settings with which options are learned alone, ladder by ladder.
 ALONE = {
     **LEARNING,
     "max_episode_steps": MAX_STEPS,
@@ -79,11 +79,11 @@ class MontezumaConfig(Config):
 
 
 def choose_rooms(config: MontezumaConfig) -> tuple[list[int], list[int]]:
-    """The rooms of the labelled states and of the unlabelled ones.
+    """Return the rooms of the labelled states, and the rooms of the unlabelled states.
 
-    Labelled are the first N groups of each sub-goal. The others are two: one without labels where the first sub-goal
-    holds somewhere and one where it holds nowhere; or two of these, if all others have labels. Source: the paper, for
-    N = 1.
+    Labelled states are from the first N groups of each sub-goal. Unlabelled states are from two rooms. In the first
+    room, which has no labels, the first sub-goal holds somewhere. In the second room the sub-goal holds nowhere. If all
+    rooms in which the sub-goal holds have labels, it holds in neither room. Source: the paper, for N = 1.
     """
     labelled: list[int] = []
     for name in config.sub_goals:
@@ -96,16 +96,16 @@ def choose_rooms(config: MontezumaConfig) -> tuple[list[int], list[int]]:
 
 
 def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
-    """Labelled, unlabelled and held-out states, each with its origin.
+    """Collect labelled, unlabelled and held-out states, each with its origin.
 
-    All 24 rooms have held-out states, the same for every N. States at the base of a ladder that continues through the
-    floor are in the unlabelled set only. No held-out stack is in another set, and no stack occurs twice in a room of a
-    set. The result does not depend on the number of processes.
+    All 24 rooms have held-out states, which are the same for every N. States at the base of a ladder that continues
+    through the floor are in the unlabelled set only. No held-out stack is in another set, and no stack occurs twice in
+    a room of a set. The result does not depend on the number of processes.
 
-    ``seed`` seeds the rollouts; each room of each set has its own stream. All three sets have labels (the unlabelled
-    states' are for tests only). Origins: see ``states.describe_states``; held-out states also have ``seen``: 0 the room
-    is in no training set, 1 it is an unlabelled room, 2 a labelled one. No emulator, or a room with too few different
-    states is a ``UserError``.
+    ``seed`` is the seed of the rollouts, with a random stream of its own for each room of each set. All three sets have
+    labels, but those of the unlabelled states are for tests only. Origins are those of ``states.describe_states``.
+    Held-out states also have ``seen``, which is 0 if the room is in no training set, 1 if it is an unlabelled room, and
+    2 if it is a labelled room. Raises ``UserError`` without the emulator, or if a room has too few different states.
     """
     labelled, unlabelled = choose_rooms(config)
     names = tuple(dict.fromkeys(config.sub_goals))
@@ -116,7 +116,7 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
         "heldout": (range(game.ROOMS), config.heldout_per_room),
     }
     jobs: list[Callable[[], States]] = []
-    places = []  # of the sets among the jobs
+    places = []  # the places of each set's jobs among all jobs
     for split, (rooms, wanted) in sets.items():
         first = len(jobs)
         jobs += [partial(gather, split, room, wanted, seed, sub_goals) for room in rooms]
@@ -138,7 +138,7 @@ def collect(config: MontezumaConfig, seed: int, progress: Any) -> Collected:
 
 
 class MontezumaDomain(Domain[MontezumaConfig]):
-    """Montezuma's Revenge; the defaults are Table 1, and for options what lets them learn on a laptop."""
+    """Montezuma's Revenge. The defaults are Table 1, and for options, settings that let them learn on a laptop."""
 
     name = "montezuma"
     sub_goals = tuple(SUB_GOALS)
@@ -163,7 +163,11 @@ class MontezumaDomain(Domain[MontezumaConfig]):
     def make_engine(
         self, layout_seed: int, count: int, max_steps: int = MAX_STEPS, *, start: str = "1L", **arguments: Any
     ) -> MontezumaEngine:
-        """The game has one layout: ``layout_seed`` seeds the start states unless ``arguments`` have a ``seed``."""
+        """Return an engine of ``count`` games.
+
+        The game has one layout, so ``layout_seed`` is the seed of the start states, unless ``arguments`` have a
+        ``seed``.
+        """
         seed = arguments.pop("seed", layout_seed)
         return MontezumaEngine(start, count, max_steps=max_steps, seed=seed, **arguments)
 

@@ -1,8 +1,8 @@
-"""Montezuma's Revenge on the Arcade Learning Environment: RAM, pictures, the agent placed anywhere.
+"""Montezuma's Revenge on the Arcade Learning Environment, with its RAM, its pictures, and the agent placed anywhere.
 
-The raw emulator instead of Gymnasium's wrappers: these cannot save, restore and write states, or skip drawing frames
-that are not needed. The observations are the same, pixel for pixel (a test compares them with ``AtariPreprocessing``
-and ``FrameStackObservation``).
+This module uses the raw emulator, because Gymnasium's wrappers cannot save, restore and write states, or skip drawing
+frames that are not needed. The observations are those of the wrappers, pixel for pixel (a test compares them with
+``AtariPreprocessing`` and ``FrameStackObservation``).
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from hypogoal.core.arrays import Bytes, Doubles, Ints
 from hypogoal.core.errors import UserError
 
 GAME = "montezuma_revenge"
-FRAME_SKIP = 4  # frames per agent step; an observation takes the brighter of the last two, pixel by pixel
-SIDE = 84
+FRAME_SKIP = 4  # frames per agent step; an observation takes the brighter of the last two frames, pixel by pixel
+SIDE = 84  # pixels on a side of an observation
 STACK = 4  # agent steps in an observation
 OBSERVATION_SHAPE = (SIDE, SIDE, STACK)  # the oldest frame first
 SCREEN = (210, 160)
@@ -24,41 +24,42 @@ ROOMS = 24
 
 NOOP, FIRE, UP, RIGHT, LEFT, DOWN = range(6)
 
-# RAM, index = the console's address - 0x80. Found by watching the emulator in play (tests repeat it); room, x, y and
-# the inventory are also in the table of Anand et al. 2019, Unsupervised State Representation Learning in Atari.
+# Indices into the RAM, which are the console's addresses - 0x80. We found them by watching the emulator in play, and
+# tests repeat that. Room, x, y and the inventory are also in the table of Anand et al. 2019, Unsupervised State
+# Representation Learning in Atari.
 RAM = {
     "room": 0x03,
     "x": 0x2A,
     "y": 0x2B,  # grows upwards, modulo 256
     "pose": 0x35,  # 8 idle or falling, 18 walking, 10 on a ladder, 6 jumping, 22 or 30 dying
     "dying": 0x37,  # counts down after a death; 0 alive
-    "lives": 0x3A,  # spare ones
+    "lives": 0x3A,  # spare lives
     "inventory": 0x41,  # bits: 01 hammer, 02-10 keys, 20 and 40 swords, 80 torch
     "object": 0x2C,  # x of a spider
     "skull": 0x2F,  # x of a skull, less an offset that the room sets
-    "row": 0x50,  # of the pyramid, from the top
+    "row": 0x50,  # the row of the pyramid, from the top
     "jump": 0x56,  # 255 on the ground, 19..0 in a jump
     "fall": 0x58,  # frames of free fall
 }
-# The bytes kept of a state, from which its labels and its kind follow.
+# The bytes that are kept of a state. The state's labels and its kind follow from them.
 FACTS = ("room", "x", "y", "skull", "object", "dying", "pose", "jump")
 ROOM, X, Y, SKULL, OBJECT, DYING, POSE, JUMP = range(len(FACTS))
 FACT_BYTES = [RAM[name] for name in FACTS]
-TORCH = 0x80  # without it rooms 16 to 23 are dark
-ON_LADDER = 10  # a pose
+TORCH = 0x80  # a bit of the inventory; without the torch, rooms 16 to 23 are dark
+ON_LADDER = 10  # the pose on a ladder
 FIRST_ROOM_OF_ROW = (0, 3, 8, 15)
 RIGHT_EDGE, LEFT_EDGE, EDGE_Y = 146, 5, 235
-ENTERED_FROM_RIGHT = (0, 3, 8, 10, 15, 16, 21)  # rooms with a wall on their left, or none beside them
-FIRST_ROOM_FRAMES = 60  # until a new game accepts actions
+ENTERED_FROM_RIGHT = (0, 3, 8, 10, 15, 16, 21)  # rooms with a wall on their left, or with no room there
+FIRST_ROOM_FRAMES = 60  # frames until a new game accepts actions
 
-# The agent is drawn in columns x - 1 .. x + 6 and rows 308 - y .. 327 - y, with x and y from RAM: read off the
-# difference of screens with the agent at two places; a test repeats it.
+# The agent is drawn in columns x - 1 .. x + 6 and rows 308 - y .. 327 - y, with x and y from RAM. We read this off the
+# difference of screens with the agent at two places, and a test repeats it.
 SPRITE_WIDTH, SPRITE_HEIGHT = 8, 20
 SPRITE_LEFT, SPRITE_TOP = -1, 308
 THREE_PLACES = (20, 75, 130)  # so far apart that the agent and its traces never overlap
 
 
-Frames = tuple[Bytes, ...]  # of the last four agent steps, uint8 (84, 84) each, oldest first
+Frames = tuple[Bytes, ...]  # the frames of the last four agent steps, uint8 (84, 84) each, the oldest first
 
 
 class Position(NamedTuple):
@@ -70,14 +71,17 @@ class Position(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """A state of the emulator and the frames before it, which the emulator does not keep."""
+    """A state of the emulator, and the last frames before it, which the emulator does not keep."""
 
     state: Any  # an ``ALEState``
     seen: Frames
 
 
 def stack_frames(seen: Sequence[Bytes]) -> Bytes:
-    """Four frames (84, 84), the oldest first, as uint8 (84, 84, 4): ``np.stack(seen, axis=-1)``, ten times faster."""
+    """Stack four frames (84, 84), the oldest first, as uint8 (84, 84, 4).
+
+    This is ``np.stack(seen, axis=-1)``, but ten times faster.
+    """
     import cv2
 
     merged: Any = cv2.merge(seen)
@@ -85,18 +89,21 @@ def stack_frames(seen: Sequence[Bytes]) -> Bytes:
 
 
 def find_row(rooms: Any) -> Any:
-    """The pyramid's row (0 the top one) of a room 0..23, or of an array of them."""
+    """Return the pyramid's row of a room 0..23, or of an array of rooms. The top row is 0."""
     return np.searchsorted(FIRST_ROOM_OF_ROW, rooms, side="right") - 1
 
 
 class Emulator:
-    """One game, deterministic: agent steps of four frames, stacks of four steps, RAM, and the agent placed anywhere.
+    """One deterministic game, with agent steps of four frames, and stacks of the frames of four steps.
 
-    It begins in the first room. It is never played to the game's end: a lost life ends an episode, and each begins with
-    all lives. Without the packages that play it, a ``UserError``.
+    The game begins in the first room. It is never played to its end, because a lost life ends an episode, and each
+    episode begins with all lives.
 
     Attributes:
-        seen: the frames of the last four agent steps; never modified: each step makes a new one.
+        seen: the frames of the last four agent steps. Each step makes a new tuple, so a tuple never changes.
+
+    Raises:
+        UserError: if a package that plays the game is missing.
     """
 
     def __init__(self) -> None:
@@ -111,7 +118,7 @@ class Emulator:
         self._cv2 = cv2
         ALEInterface.setLoggerMode(LoggerMode.Error)
         self.ale = ALEInterface()
-        self.ale.setInt("random_seed", 0)  # without sticky actions nothing depends on it
+        self.ale.setInt("random_seed", 0)  # nothing depends on the seed, because no action is sticky
         self.ale.setFloat("repeat_action_probability", 0.0)
         self.ale.setInt("frame_skip", 1)
         rom: Any = get_rom_path(GAME)
@@ -125,11 +132,11 @@ class Emulator:
 
     @property
     def stack(self) -> Bytes:
-        """The observation, uint8 (84, 84, 4), a new array."""
+        """The observation, uint8 (84, 84, 4), in a new array."""
         return stack_frames(self.seen)
 
     def step(self, action: int) -> float:
-        """Play four frames of ``action`` (0..17); returns the sum of their rewards."""
+        """Play four frames of ``action`` (0..17). Return the sum of their rewards."""
         act, number = self.ale.act, self.actions[action]
         reward = 0.0
         for _ in range(FRAME_SKIP - len(self._screens)):
@@ -137,51 +144,52 @@ class Emulator:
         for screen in self._screens:
             reward += act(number)
             self.ale.getScreenGrayscale(screen)
-        # NumPy's maximum, if it uses AVX-512, slows down the emulator's next frames by a seventh.
+        # NumPy's maximum would slow down the emulator's next frames by a seventh, if it uses AVX-512.
         brighter = self._cv2.max(*self._screens)
         frame: Any = self._cv2.resize(brighter, (SIDE, SIDE), interpolation=self._cv2.INTER_AREA)
         self.seen = (*self.seen[1 - STACK :], frame)
         return reward
 
     def frames(self, action: int, count: int) -> None:
-        """Play ``count`` single frames of ``action`` undrawn: no agent step, the stack stays as it is."""
+        """Play ``count`` single frames of ``action`` without drawing. This is no agent step, so the stack stays."""
         for _ in range(count):
             self.ale.act(self.actions[action])
 
     def facts(self) -> Bytes:
-        """The bytes of ``FACTS``, uint8 (8,), a new array."""
+        """Return the bytes of ``FACTS``, uint8 (8,), in a new array."""
         return self.ale.getRAM()[FACT_BYTES]
 
     def read(self, name: str) -> int:
-        """One byte of ``RAM`` by name."""
+        """Return one byte of ``RAM`` by name."""
         return int(self.ale.getRAM()[RAM[name]])
 
     def write(self, name: str, value: int) -> None:
-        """Write one byte of ``RAM`` by name; the screen shows it with the next frame."""
+        """Write one byte of ``RAM`` by name. The screen shows the change with the next frame."""
         self.ale.setRAM(RAM[name], value)
 
     def position(self) -> Position:
-        """The agent's position."""
+        """Return the agent's position."""
         return Position(self.read("room"), self.read("x"), self.read("y"))
 
     def alive(self) -> bool:
-        """Whether the agent is not dying."""
+        """Return whether the agent is not dying."""
         return self.read("dying") == 0
 
     def save(self) -> Snapshot:
-        """The current state, for :meth:`restore`."""
+        """Return the current state, for :meth:`restore`."""
         return Snapshot(self.ale.cloneState(), self.seen)
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Return to a state saved by this or another emulator; the screen shows it after the next step."""
+        """Return to a state that this emulator or another one saved. The screen shows the state after the next step."""
         self.ale.restoreState(snapshot.state)
         self.seen = snapshot.seen
 
     def place(self, room: int, x: int, y: int, *, phase: int = 2, settle: int = STACK) -> Snapshot | None:
-        """Place the agent at (x, y) of a room, with the torch, ``phase`` frames after entering.
+        """Place the agent at (x, y) of a room, with the torch, ``phase`` frames after it entered the room.
 
-        The agent enters through the room's side, from its neighbour: writing the room's number alone draws half a room.
-        Then it waits for ``settle`` agent steps. None if it died meanwhile or left the room.
+        The agent enters through the room's side, from the neighbouring room, because writing the room's number alone
+        draws half a room. Then the agent waits for ``settle`` agent steps. Returns the state, or None if the agent died
+        meanwhile or left the room.
         """
         if room not in self._entered:
             self._entered[room] = self._enter(room)
@@ -195,7 +203,10 @@ class Emulator:
         return self.save() if stays and self.alive() else None
 
     def new_game(self, phase: int) -> Snapshot:
-        """Begin a new game; the agent waits for ``phase`` frames once it may act, then fills the stack."""
+        """Begin a new game, and return its state.
+
+        Once the agent may act, it waits for ``phase`` frames, and then for the agent steps that fill the stack.
+        """
         self.ale.restoreState(self._first_room)
         self.frames(NOOP, phase)
         for _ in range(STACK):
@@ -203,7 +214,7 @@ class Emulator:
         return self.save()
 
     def _enter(self, room: int) -> Any:
-        """The emulator's state right after the agent entered a room."""
+        """Return the emulator's state right after the agent entered a room."""
         if room in ENTERED_FROM_RIGHT:
             neighbour, x, action = room + 1, LEFT_EDGE, LEFT
         else:
@@ -221,7 +232,10 @@ class Emulator:
 
 
 def pixel(positions: Ints) -> Doubles:
-    """The agent's middle in the console's picture: column, row (n, 2), for positions (n, 3) of room, x, y."""
+    """Return the column and row of the agent's middle in the console's picture, (n, 2).
+
+    ``positions`` (n, 3) are room, x and y.
+    """
     _, x, y = positions.T
     columns = x + SPRITE_LEFT + (SPRITE_WIDTH - 1) / 2
     rows = SPRITE_TOP - y + (SPRITE_HEIGHT - 1) / 2
@@ -229,9 +243,9 @@ def pixel(positions: Ints) -> Doubles:
 
 
 def picture(emulator: Emulator, room: int) -> Bytes:
-    """A room as the console shows it, with enemies but without the agent: uint8 (210, 160, 3).
+    """Draw a room as the console shows it, with enemies but without the agent, uint8 (210, 160, 3).
 
-    Of three pictures with the agent at three places, two agree on every pixel.
+    The picture is the median of three pictures with the agent at three places, two of which agree at every pixel.
     """
     shots = []
     for x in THREE_PLACES:

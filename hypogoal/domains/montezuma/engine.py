@@ -1,6 +1,6 @@
-"""The training engine of Montezuma's Revenge: many emulators stepped together, states by id, each frame kept once.
+"""The training engine of Montezuma's Revenge, which steps many emulators together, and keeps each frame once.
 
-An observation is four frames, of 7 kB each, and each step adds one, so states share frames.
+An observation is four frames, of 7 kB each. Each step adds one frame, so states share frames.
 """
 
 from collections.abc import Mapping
@@ -19,17 +19,17 @@ from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.env import MAX_STEPS, START_STATES, make_starts
 from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, judge_sub_goals
 
-MEMORY = 110_000  # states; the replay of Table 2 (1e5 transitions) and those not yet in it
+MEMORY = 110_000  # states, for the replay of Table 2 (1e5 transitions) and those that are not yet in the replay
 
 
 class MontezumaEngine(TurnEngine):
     """Many games that begin at one ladder or elsewhere, stepped together.
 
-    Every step of every environment gets a new id. Images are available for the newest ``memory`` of these, at least one
-    for each environment; positions and labels for all.
+    Every step of every environment gives a state with a new id. Images are available for the newest ``memory`` states,
+    and ``memory`` must be at least ``count``. Positions and labels are available for all states.
 
-    Arguments as for ``MontezumaLadder``, and ``count``, the number of environments (E). ``seed`` also draws the start
-    state each episode begins with.
+    The arguments are those of ``MontezumaLadder``, and ``count``, the number of environments (E). ``seed`` is the seed
+    of the start states, and of the draw of a start state for each episode.
     """
 
     CHANGING = (*TurnEngine.CHANGING, "_rng")
@@ -53,8 +53,8 @@ class MontezumaEngine(TurnEngine):
         self.count, self.max_steps = count, max_steps
         self.memory = self.room = memory
         self._emulators = [game.Emulator() for _ in range(count)]
-        self._threads = ThreadPoolExecutor(min(cores(), count))  # the emulator lets other threads run meanwhile
-        self._rewards: list[float] = []  # of the step that is played
+        self._threads = ThreadPoolExecutor(min(cores(), count))  # while an emulator plays, other threads run
+        self._rewards: list[float] = []  # the rewards of the step that is being played
         emulator = self._emulators[0]
         self.starts = make_starts(emulator, start, start_states, seed)
         self._rng = rng_for(seed, "start-of-episode")
@@ -90,10 +90,10 @@ class MontezumaEngine(TurnEngine):
         return judge_sub_goals(facts, SUB_GOALS.values())
 
     def snapshot(self) -> dict[str, Any]:
-        """All that a resumed run needs, nearly all of it the frames in memory."""
+        """Return all that a resumed run needs, which is mostly the frames in memory."""
         stacks = [*self._seen.values()]
         stacks += [emulator.seen for emulator in self._emulators]
-        frames = {id(frame): frame for frame in chain(*stacks)}  # each once
+        frames = {id(frame): frame for frame in chain(*stacks)}  # each frame once
         place = {address: row for row, address in enumerate(frames)}
         rows = [place[id(frame)] for frame in chain(*stacks)]
         states = []
@@ -112,7 +112,7 @@ class MontezumaEngine(TurnEngine):
         from ale_py import ALEState
 
         super().restore(snapshot)
-        frames = [frame.copy() for frame in snapshot["frames"]]  # copies, which can be freed one by one
+        frames = [frame.copy() for frame in snapshot["frames"]]  # because copies can be freed one by one
         stacks = [itemgetter(*rows)(frames) for rows in snapshot["stacks"].tolist()]
         self._seen = dict(zip(self.kept, stacks[: -self.count], strict=True))
         playing = stacks[-self.count :]

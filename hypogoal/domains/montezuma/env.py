@@ -1,6 +1,6 @@
-"""Montezuma's Revenge from the top of a ladder or elsewhere, a Gymnasium environment; its start states.
+"""Montezuma's Revenge from the top of a ladder or elsewhere, as a Gymnasium environment, and its start states.
 
-This is the reference: tests compare the training engine (``engine.py``) with it.
+This environment is the reference, with which tests compare the training engine (``engine.py``).
 """
 
 from typing import Any, NamedTuple
@@ -17,19 +17,19 @@ from hypogoal.domains.montezuma.emulator import Position
 from hypogoal.domains.montezuma.ladders import LADDERS, MEASURED
 from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, around, inside, judge_sub_goals
 
-MAX_STEPS = 200  # agent steps an episode; an option's own time in Table 2
+MAX_STEPS = 200  # agent steps of an episode, which are the time limit of an option in Table 2
 START_STATES = 32
-PHASES = range(2, 258)  # frames that the agent may wait before it starts
-TRIES = 4  # phases tried per start state
+PHASES = range(2, 258)  # numbers of frames that the agent may wait before it starts
+TRIES = 4  # the most phases tried per start state
 
 
 class Beginning(NamedTuple):
-    """Where episodes may begin, and the script by which the agent must get alive from there to ``end``."""
+    """A place where episodes may begin, and the script by which the agent must get alive from there to ``end``."""
 
     at: Position
     end: Position
-    action: int = game.NOOP  # of the script
-    steps: int = 1  # agent steps of it
+    action: int = game.NOOP  # the action that the script repeats
+    steps: int = 1  # the number of agent steps of the script
 
 
 NEW_GAME = "game"
@@ -45,11 +45,12 @@ for _name, _numbers in MEASURED["starts"].items():
 
 
 def make_starts(emulator: game.Emulator, name: str, count: int, seed: int) -> list[game.Snapshot]:
-    """States at a beginning, such as the top of a ladder, from which its script survives.
+    """Return ``count`` states at a beginning, such as the top of a ladder, from which the agent survives the script.
 
-    They differ in the phase of what moves, drawn from ``seed``, and look different if ``TRIES`` phases per state offer
-    enough different looks. The top of 14-22 has one look only; its states differ out of sight. The emulator's state is
-    changed. An unknown name and too few such states are a ``UserError``.
+    The states differ in the phase of what moves in the room, which is drawn from ``seed``. The states look different if
+    ``TRIES`` phases per state offer enough different looks. The top of 14-22 has one look only, so its states differ
+    out of sight. The emulator's state changes. Raises ``UserError`` if the name is unknown, or if too few states are
+    found.
     """
     if name not in BEGINNINGS:
         raise UserError("unknown start", name, f"Choose one of {', '.join(BEGINNINGS)}.")
@@ -75,7 +76,7 @@ def make_starts(emulator: game.Emulator, name: str, count: int, seed: int) -> li
 
 
 def _start(emulator: game.Emulator, name: str, phase: int) -> game.Snapshot | None:
-    """The beginning in a phase; None if its script does not survive from there."""
+    """Return the state at a beginning in a phase, or None if the agent does not survive the script from there."""
     beginning = BEGINNINGS[name]
     if name == NEW_GAME:
         start: game.Snapshot | None = emulator.new_game(phase)
@@ -87,7 +88,10 @@ def _start(emulator: game.Emulator, name: str, phase: int) -> game.Snapshot | No
 
 
 def arrives(emulator: game.Emulator, beginning: Beginning) -> bool:
-    """Play the script, undrawn, such as DOWN from a ladder's top to its base; whether the agent arrives alive."""
+    """Play the script without drawing, such as DOWN from a ladder's top to its base.
+
+    Return whether the agent arrives alive.
+    """
     for _ in range(beginning.steps):
         emulator.frames(beginning.action, game.FRAME_SKIP)
         if not emulator.alive():
@@ -98,17 +102,18 @@ def arrives(emulator: game.Emulator, beginning: Beginning) -> bool:
 
 
 class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
-    """Montezuma's Revenge from the top of a ladder or elsewhere. Gymnasium id ``hypogoal/MontezumaLadder-v0``.
+    """Montezuma's Revenge from the top of a ladder or elsewhere.
 
-    An observation is the last four agent steps' frames, uint8 (84, 84, 4), grey, oldest first; 18 actions, each
-    played for four frames; the reward is the game's; an episode terminates when the agent begins to die. ``info`` has
-    ``labels`` (sub-goal: whether it holds), ``position`` (room, x, y in RAM units) and ``alive``.
+    The Gymnasium id is ``hypogoal/MontezumaLadder-v0``. An observation is the grey frames of the last four agent steps,
+    uint8 (84, 84, 4), the oldest first. Each of 18 actions is played for four frames. The reward is the game's. An
+    episode terminates when the agent begins to die. ``info`` has ``labels`` (whether each sub-goal holds, by name),
+    ``position`` (room, x, y in RAM units) and ``alive``.
 
     Args:
-        start: a ladder or another of ``BEGINNINGS``.
-        max_steps: agent steps after which an episode is truncated.
-        start_states: the number of start states, see ``make_starts``. ``reset(seed)`` draws one of them,
-            ``reset(options={"start_state": n})`` takes the n-th.
+        start: a name among ``BEGINNINGS``, such as a ladder's.
+        max_steps: the number of agent steps after which an episode is truncated.
+        start_states: the number of start states, see ``make_starts``. ``reset(seed)`` draws a start state, and
+            ``reset(options={"start_state": n})`` takes start state n, counted from 0.
     """
 
     def __init__(self, start: str = "1L", max_steps: int = MAX_STEPS, start_states: int = START_STATES):
@@ -125,7 +130,7 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
         seed: int | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Bytes, dict[str, Any]]:
-        """Begin an episode with one of the start states."""
+        """Begin an episode in a start state."""
         super().reset(seed=seed)
         number = (options or {}).get("start_state")
         if number is None:
@@ -135,7 +140,7 @@ class MontezumaLadder(gymnasium.Env[Bytes, np.int64]):
         return self.emulator.stack, self._info()
 
     def step(self, action: Any) -> tuple[Bytes, float, bool, bool, dict[str, Any]]:
-        """Four frames of an action."""
+        """Play four frames of an action."""
         reward = self.emulator.step(int(action))
         self.elapsed += 1
         info = self._info()

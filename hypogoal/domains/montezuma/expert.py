@@ -15,34 +15,34 @@ from hypogoal.domains.montezuma.ladders import BASES, LADDERS, SHAFT_ENTRY, SHAF
 from hypogoal.domains.montezuma.sub_goals import REACH, SubGoal
 
 ROLLOUT_STEPS = 40
-PHASES = (2, 200)  # frames for which the room's enemies move before the first step
+PHASES = (2, 200)  # the fewest and the most frames for which a room's enemies move before the first step
 ROLLOUTS_PER_PHASE = 4
-STARTS = {  # shares, among the kinds that a room has
+STARTS = {  # the shares of starts by kind, among the kinds that a room has
     "spot": 0.5,
     "ladder": 0.15,
     "side": 0.1,
     "anywhere": 0.25,
 }
 
-LONGEST_REPEAT = 8  # agent steps of one action
-JITTER = 0.1  # share of the steps with another action in between
+LONGEST_REPEAT = 8  # the most agent steps for which one action is repeated
+JITTER = 0.1  # share of the steps at which a random action is played instead
 HEADINGS = (game.DOWN, game.UP, game.LEFT, game.RIGHT)
 HEADING = 0.7  # share of the actions that are a heading; the others are any action
-CLOSE = 1  # distance from a spot, in RAM units, at which an agent that heads for it stops
-STEPS_ASIDE = 3  # most steps from a spot or side before a rollout begins
-HELD = 0.5  # share of the starts at a spot where the agent stays there, against the conveyor belt in room 1
+CLOSE = 1  # distance from a spot, in RAM units, at which an agent that heads for the spot stops
+STEPS_ASIDE = 3  # the most agent steps away from a spot or side before a rollout begins
+HELD = 0.5  # share of the starts at a spot where the agent stays at the spot, against the conveyor belt in room 1
 STRIDE = 4  # RAM units that the agent walks or climbs in an agent step
 
 # Where the agent can be placed.
-BLACK_SHARE = 0.95  # of the agent's box if it stands in the open; the rows of its feet are all black
-FEET = 4  # rows
-SNAP = 3  # in some rooms the floor is drawn so much below the row of entry
+BLACK_SHARE = 0.95  # the least black share of the agent's box in the open; the rows of its feet must be all black
+FEET = 4  # the rows of the agent's feet
+SNAP = 3  # in some rooms the floor is drawn up to this many RAM units below the row of entry
 LAVA_ROOMS = (10, 18, 20, 22)
-LAVA_BELOW = 220  # y; the agent stands on lava only if placed there
+LAVA_BELOW = 220  # the y below which there is lava, on which the agent stands only if it is placed there
 
 
 class Shown(NamedTuple):
-    """One state of a rollout: the observation, uint8 (84, 84, 4), its facts, uint8 (8,), and the last two actions."""
+    """A state of a rollout: its observation, uint8 (84, 84, 4), its facts, uint8 (8,), and the last two actions."""
 
     stack: Bytes
     facts: Bytes
@@ -56,10 +56,11 @@ class Shown(NamedTuple):
 
 
 class Expert:
-    """Plays in a room; ``rng`` draws all that it does.
+    """A script that plays in a room. ``rng`` makes all random choices.
 
-    A rollout begins at one of ``STARTS``; several of a kind take turns. Its actions are repeated, most of them
-    headings; some lead to a spot. It ends when the agent leaves the room or would revive after a death.
+    A rollout begins at a start, whose kind is drawn by ``STARTS``. The starts of a kind take turns. Actions are
+    repeated for some steps. Some actions lead to a spot, and most of the others are headings. A rollout ends when the
+    agent leaves the room, or would revive after a death.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class Expert:
             "side": sides,
             "ladder": find_climbs(room),
         }
-        self.in_turn = {}  # each kind's starts, in a random order, again and again
+        self.in_turn = {}  # the starts of each kind, in a random order, again and again
         for kind, rows in starts.items():
             if rows:
                 order = rng.permutation(rows)
@@ -93,7 +94,10 @@ class Expert:
         self.chances = weights / weights.sum()
 
     def play(self) -> Iterator[Shown]:
-        """Endlessly, the states of rollouts, of which some begin with the room's enemies in the same random phase."""
+        """Yield the states of rollouts, without end.
+
+        ``ROLLOUTS_PER_PHASE`` rollouts at a time begin with the room's enemies in one random phase.
+        """
         while True:
             phase = int(self.rng.integers(*PHASES, endpoint=True))
             scene = self.emulator.place(self.room, game.RIGHT_EDGE, game.EDGE_Y, phase=phase, settle=0)
@@ -106,7 +110,10 @@ class Expert:
                     yield from self._rollout(first)
 
     def _begin(self) -> Shown | None:
-        """Bring the agent to a start and fill the stack; None unless it is alive in the room then."""
+        """Bring the agent to a start and fill the stack.
+
+        Return the state, or None if the agent is dying or left the room.
+        """
         stays = self._place()
         action = previous = game.NOOP
         for _ in range(game.STACK):
@@ -119,10 +126,13 @@ class Expert:
         return shown if stayed and not shown.dying else None
 
     def _place(self) -> bool:
-        """Place the agent where a rollout begins; whether it is to stay at the spot while the stack fills."""
+        """Place the agent where a rollout begins.
+
+        Return whether the agent is to stay at a spot while the stack fills.
+        """
         rng, emulator = self.rng, self.emulator
         kind = self.kinds[rng.choice(len(self.kinds), p=self.chances)]
-        action, steps = game.NOOP, 0  # which it plays for so many agent steps, undrawn
+        action, steps = game.NOOP, 0  # the agent plays ``action`` for ``steps`` agent steps, which are not drawn
         stays = False
         if kind == "anywhere":
             row = rng.integers(len(self.places))
@@ -145,7 +155,7 @@ class Expert:
         return stays
 
     def _rollout(self, shown: Shown) -> Iterator[Shown]:
-        """A state and those after it."""
+        """Yield the first state of a rollout, and then the states after it."""
         yield shown
         action, left = game.NOOP, 0
         homing = self.rng.random() if self.spots else 0.0
@@ -165,7 +175,7 @@ class Expert:
             yield shown
 
     def _next_action(self, homing: float) -> tuple[int, int]:
-        """An action, towards a spot with the probability ``homing``, and its number of agent steps."""
+        """Draw an action, and its number of agent steps. The action leads to a spot with the probability ``homing``."""
         if self.rng.random() < homing:
             return towards(self.emulator.position(), self.spots)
         if self.rng.random() < HEADING:
@@ -178,7 +188,7 @@ class Expert:
 
 
 def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
-    """An action that moves the agent to the nearest spot or holds it there, and its number of agent steps."""
+    """Return an action that moves the agent to the nearest spot or holds it there, and its number of agent steps."""
     spot = min(spots, key=lambda spot: abs(position.x - spot.x) + abs(position.y - spot.y))
     aside = spot.x - position.x
     if abs(aside) > CLOSE:
@@ -192,7 +202,10 @@ def towards(position: Position, spots: Sequence[Position]) -> tuple[int, int]:
 
 
 def find_climbs(room: int) -> list[tuple[int, int, int, int]]:
-    """Each climb that begins in a room: its x, y and action, and the most agent steps without leaving the room."""
+    """Return the climbs that begin in a room.
+
+    A climb is x and y where it begins, its action, and the most agent steps in which it does not leave the room.
+    """
     climbs = []
     for ladder in LADDERS:
         highest, lowest = ladder.top.y, ladder.base.y
@@ -206,15 +219,15 @@ def find_climbs(room: int) -> list[tuple[int, int, int, int]]:
 
 
 def find_standing_places(emulator: Emulator, room: int) -> Ints:
-    """Places x, y (n, 2) of a room where an agent placed there stands on something, in the open.
+    """Return the places of a room where an agent stands on something, in the open, as x and y, int64 (n, 2).
 
-    Many places lie inside walls, so the agent's box must be black, with something under its feet. Room 15 has no black
-    places; for it, the row of entry is taken.
+    Many places lie inside walls, so the agent's box must be black, with something under the feet. Room 15 has no black
+    places, so the row of entry is taken.
     """
     black = ~game.picture(emulator, room).any(2)
     x = np.arange(game.LEFT_EDGE, game.RIGHT_EDGE + 1)
     y = np.arange(SHAFT_EXIT, SHAFT_ENTRY + 1)
-    # The agent's box at each place, and below it the row under the feet.
+    # The agent's box at each place, and below the box the row under the feet.
     boxes = sliding_window_view(black, (game.SPRITE_HEIGHT + 1, game.SPRITE_WIDTH))
     boxes = boxes[np.ix_(game.SPRITE_TOP - y, x + game.SPRITE_LEFT)]
     body = boxes[:, :, :-1]

@@ -1,4 +1,4 @@
-"""States of a room of Montezuma's Revenge from scripted play, with labels and origins."""
+"""How states of a room of Montezuma's Revenge are gathered by scripted play, with labels and origins."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from hypogoal.observations import digest
 KINDS = ("base", "near-base", "on-ladder", "top", "jumping", "dying", "elsewhere")
 BASE, NEAR_BASE, CLIMBING, TOP, JUMPING, DEAD, ELSEWHERE = range(len(KINDS))
 NEAR_BASES = around(BASES, 12)
-LADDER_POSES = (ON_LADDER, 0)  # climbing, holding still; on ropes 14 and 4
-ON_GROUND = 255  # the RAM's value for the jump without one
+LADDER_POSES = (ON_LADDER, 0)  # climbing, and holding still; on ropes the poses are 14 and 4
+ON_GROUND = 255  # the RAM's value of ``jump`` on the ground
 
-POSITIVE = len(KINDS)  # in place of its kind, where a sub-goal holds
-# The least shares of a room's states by kind, as far as the rollouts reached them.
+POSITIVE = len(KINDS)  # stands for a state's kind, where a sub-goal holds
+# The least shares of a room's states by kind, as far as the rollouts reached such states.
 KIND_SHARES = {
     POSITIVE: 0.2,
     NEAR_BASE: 0.15,
@@ -40,16 +40,20 @@ KIND_SHARES = {
     JUMPING: 0.1,
     DEAD: 0.1,
 }
-SPARE = 1.25  # states to gather, relative to those to keep
-# Play in a room until these shares of the states to keep are positive, at all its places and at each.
+SPARE = 1.25  # the number of states to gather, relative to the number to keep
+# The least shares of positives among the states to keep, at all places of a room together, and at each place. The room
+# is played in until they are reached.
 FEWEST_POSITIVES, FEWEST_AT_A_PLACE = 0.1, 0.02
 MOST_STEPS = 60  # agent steps per state to keep, after which a room is given up; two to four are usual
-At = tuple[str, int]  # a sub-goal's name and the index of its place
-HELD_OUT_EACH = 3  # every third stack, by its digest, may be held out; all others, and only they, are for training
+At = tuple[str, int]  # a sub-goal's name, and the index of a place of the sub-goal
+HELD_OUT_EACH = 3  # one stack in three, by its digest, may be held out, and the other stacks are for training
 
 
 def tell_kinds(facts: Ints) -> Ints:
-    """Each state's kind, an index into ``KINDS``, int64 (n,), from facts (n, ``FACTS``): the first that fits."""
+    """Return each state's kind, an index into ``KINDS``, int64 (n,), from facts (n, ``FACTS``).
+
+    If several kinds fit, the first of ``fits`` is taken.
+    """
     fits = {
         DEAD: facts[:, DYING] > 0,
         BASE: CLIMB_DOWN.at(facts) >= 0,
@@ -62,11 +66,11 @@ def tell_kinds(facts: Ints) -> Ints:
 
 
 def describe_states(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> States:
-    """Observations, labels of the sub-goals (n, G), and origins, int64 (n,) each.
+    """Return states with observations, labels of the sub-goals, bool (n, G), and origins, int64 (n,) each.
 
-    Origins: room, x, y; group 1..7 of the room (0: it has no ladder); kind, an index into ``KINDS``; ladder, the index
-    of the first sub-goal's place at which the state is, see ``SubGoal.at``; dying, 0 or 1; action, 0..17, that led to
-    the last frame, and previous_action, that led to the one before.
+    The origins are room, x and y; group, the room's group 1..7, or 0 if the room has no ladder; kind, an index into
+    ``KINDS``; ladder, the index of the first sub-goal's place at which the state is, see ``SubGoal.at``; dying, 0 or 1;
+    action, 0..17, which led to the last frame; and previous_action, which led to the frame before.
     """
     stacks, every, actions, previous = zip(*shown, strict=True)
     facts = np.stack(every).astype(int)
@@ -90,10 +94,10 @@ def describe_states(shown: Sequence[Shown], sub_goals: Sequence[SubGoal]) -> Sta
 
 
 def gather(split: str, room: int, wanted: int, seed: int, sub_goals: Sequence[SubGoal]) -> States:
-    """``wanted`` different states of a room: rollouts until there are enough, then a choice among them.
+    """Gather ``wanted`` different states of a room, by rollouts until there are enough, and a choice among the states.
 
-    Only the ``unlabelled`` ones are also at unclear places, such as bases of ladders that continue through the floor.
-    A room with too few different states is a ``UserError``.
+    Only ``unlabelled`` states are also at unclear places, such as bases of ladders that continue through the floor.
+    Raises ``UserError`` if the room has too few different states.
     """
     held_out = split == "heldout"
     stream = (split, 0) if held_out else (split,)
@@ -147,13 +151,16 @@ def gather(split: str, room: int, wanted: int, seed: int, sub_goals: Sequence[Su
 
 
 def choose(kinds: Ints, positions: Ints, wanted: int, rng: Generator) -> Ints:
-    """Ordered indices of ``wanted`` of n states: each kind's share, spread over positions; the others at random."""
-    from pandas import DataFrame  # takes longer to import than most stages need it
+    """Choose ``wanted`` of n states. Return their indices in order, int64 (wanted,).
+
+    Each kind has at least its share, spread over positions. The other states are chosen at random.
+    """
+    from pandas import DataFrame  # not above, because the import takes long, and most stages do not need it
 
     order = rng.permutation(len(kinds))
     rows = np.column_stack([kinds, positions])
     alike = DataFrame(rows[order])
-    ranks = alike.groupby([*alike]).cumcount()  # the first of a kind and position come before the second of any
+    ranks = alike.groupby([*alike]).cumcount()  # first states of a kind and position come before any second state
     spread = order[np.argsort(ranks, kind="stable")]
     first = []
     for kind, share in KIND_SHARES.items():

@@ -1,8 +1,9 @@
-"""The sub-goals on Montezuma's Revenge: where each holds, by the console's memory, and rooms that label it.
+"""The sub-goals on Montezuma's Revenge: where they hold, by the console's memory, and in which rooms they are labelled.
 
-The paper has the first, ``CLIMB_DOWN``: the agent lives and is within ``REACH`` of a ladder's base, in x and in y. The
-others are in its authors' repository (``monte_terminations.py``). One more is one more entry of ``ALL``, and its
-rooms in ``measured.toml``, where enemies and lasers are, too. Where the authors' code differs is in docs/deviations.md.
+The paper has the first sub-goal, ``CLIMB_DOWN``, in which the agent lives and is within ``REACH`` of a ladder's base,
+in x and in y. The other sub-goals are in the authors' repository (``monte_terminations.py``), and docs/deviations.md
+says where the authors' code differs. To add a sub-goal, add an entry to ``ALL``, and its rooms to ``measured.toml``,
+which also has enemies and lasers.
 """
 
 from collections.abc import Collection, Iterable
@@ -17,18 +18,21 @@ from hypogoal.core.errors import UserError
 from hypogoal.domains.montezuma.emulator import DYING, OBJECT, ROOM, SKULL, Position, X, Y
 from hypogoal.domains.montezuma.ladders import BASES, FAR, MEASURED, TOPS
 
-REACH = 2  # at a place: at most this far from it, in x and in y
-BETWEEN_SPOTS = 8  # RAM units
+REACH = 2  # RAM units in x and in y; an agent that is at most this far from a place is at the place
+BETWEEN_SPOTS = 8  # RAM units between two spots
 LASER_Y = 235
 LABELLED_ROOMS = MEASURED["rooms"]  # by sub-goal
 ENEMIES = [*MEASURED["enemies"].values()]
-# By room, where an agent stands left of each laser gate, and right of it.
+# For each room's laser gates, x of an agent left of the gate, and right of the gate.
 GATES = {int(room): gates for room, gates in MEASURED["gates"].items()}
 Places = tuple[Position, ...]
 
 
 class Region(NamedTuple):
-    """Where agents are: in a room, within these x and y; x is counted from that of the room's skull or spider if so."""
+    """A rectangle of x and y in a room.
+
+    With ``from_skull`` or ``from_spider``, x is counted from the x of the room's skull or spider.
+    """
 
     room: int
     left: int
@@ -40,13 +44,13 @@ class Region(NamedTuple):
 
 
 def around(places: Iterable[Position], reach: int = REACH) -> Ints:
-    """The regions within ``reach`` of places, in x and in y, int64 (m, ``Region``)."""
+    """Return the regions within ``reach`` of m places, in x and in y, int64 (m, ``Region``)."""
     regions = [Region(room, x - reach, x + reach, y - reach, y + reach) for room, x, y in places]
     return np.array(regions)
 
 
 def inside(regions: Ints, facts: NDArray[np.integer]) -> Bools:
-    """Whether agents, facts (n, ``FACTS``), are in regions (m, ``Region``), bool (n, m)."""
+    """Return whether agents, facts (n, ``FACTS``), are in regions (m, ``Region``), bool (n, m)."""
     room, left, right, low, high, *moving = regions.T
     enemy = facts[:, [SKULL, OBJECT]] @ np.stack(moving)
     x = facts[:, [X]] - enemy
@@ -59,15 +63,15 @@ def inside(regions: Ints, facts: NDArray[np.integer]) -> Bools:
 
 @dataclass(frozen=True)
 class SubGoal:
-    """A sub-goal: it holds for a living agent in one of its regions.
+    """A sub-goal, which holds for a living agent in one of its regions.
 
     Attributes:
-        places: one in each region; distances are to the nearest.
+        places: one place in each region. Distances are to the nearest place.
         regions: int64 (m, ``Region``).
-        spots: where the expert is placed and heads for. Something must be under its feet, or a ladder, since an agent
-            that is placed in the air falls: where the sub-goal holds in the air only, give the ground from which agents
-            get there.
-        sides: where it is placed, too.
+        spots: places where the expert is placed, and to which it heads. A spot must be on ground or on a ladder, since
+            an agent that is placed in the air falls. If the sub-goal holds only in the air, give the ground from which
+            agents get there.
+        sides: further places where the expert is placed.
         unclear: indices of places whose states are labelled nowhere.
     """
 
@@ -79,20 +83,26 @@ class SubGoal:
     unclear: Collection[int] = ()
 
     def at(self, facts: NDArray[np.integer]) -> Ints:
-        """The index of the place at which agents are, facts (n, ``FACTS``), dead or alive; -1 for none; int64 (n,)."""
+        """Return the index of the place at which each agent is, dead or alive, or -1 for none, int64 (n,).
+
+        ``facts`` are (n, ``FACTS``).
+        """
         is_inside = inside(self.regions, facts)
         return np.where(is_inside.any(1), is_inside.argmax(1), -1)
 
 
 def judge_sub_goals(facts: NDArray[np.integer], sub_goals: Iterable[SubGoal]) -> Bools:
-    """Whether each sub-goal holds, bool (n, G), by facts (n, ``FACTS``)."""
+    """Return whether each sub-goal holds, bool (n, G), by facts (n, ``FACTS``)."""
     reached = [sub_goal.at(facts) >= 0 for sub_goal in sub_goals]
     lives = facts[:, [DYING]] == 0
     return np.stack(reached, axis=1) & lives
 
 
 def _climb(name: str, ends: Places, others: Places) -> SubGoal:
-    """Be at one end of a ladder; ends that are another ladder's other end are labelled nowhere."""
+    """Return the sub-goal to be at an end of a ladder, one of ``ends``.
+
+    An end that is among ``others``, the other ends of all ladders, is labelled nowhere.
+    """
     unclear = {index for index, end in enumerate(ends) if end in others}
     return SubGoal(
         name,
@@ -105,7 +115,7 @@ def _climb(name: str, ends: Places, others: Places) -> SubGoal:
 
 
 def _pass(side: str) -> SubGoal:
-    """Be past an enemy on a side of it, on its floor."""
+    """Return the sub-goal to be past an enemy, on a side of the enemy, on the enemy's floor."""
     places, spots, regions = [], [], []
     for enemy in ENEMIES:
         room, y = enemy["room"], enemy["y"]
@@ -130,7 +140,7 @@ def _pass(side: str) -> SubGoal:
 
 
 def _pass_lasers() -> SubGoal:
-    """Stand left of a laser gate, as the authors' data do."""
+    """Return the sub-goal to stand left of a laser gate, as in the authors' data."""
     before, behind = [], []
     for room, gates in GATES.items():
         before += [Position(room, left, LASER_Y) for left, _ in gates]

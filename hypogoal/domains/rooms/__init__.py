@@ -1,1 +1,1 @@
-"""Rooms: hypothesis learning with a known answer, since the features of its scenes are planted."""
+"""Rooms, a domain in which the right hypothesis is known, because the features of its scenes are planted."""

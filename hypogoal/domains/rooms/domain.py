@@ -1,7 +1,7 @@
-"""Rooms, one of which has the feature that is rewarded.
+"""The domain of rooms, one of which has the feature that is rewarded.
 
-An agent stands before some rooms and enters one. In the labelled states several features agree, so only the reward can
-tell which of them counts: ``truth`` of the world that an agent is trained in.
+An agent stands before some rooms and enters one of them. In the labelled states several features agree, so only the
+reward can tell which feature counts. That feature is ``truth``, a setting of the world in which an agent is trained.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from hypogoal.domains.rooms.engine import RoomsConfig, RoomsEngine
 from hypogoal.domains.rooms.states import MEANINGS, SIDE, Scenes, crossed_states, labelled_states, unlabelled_states
 
 SUB_GOALS = ("right-room",)
-HELDOUT = 20  # layouts of held-out states
+HELDOUT = 20  # the number of layouts of held-out states
 
 DEFAULTS = {
     "train-ensemble": {
@@ -38,7 +38,10 @@ class RoomsDomain(Domain[RoomsConfig]):
     observation_shape = (SIDE, SIDE, 3)
 
     def collect(self, config: RoomsConfig, seed: int, progress: Any) -> Collected:
-        """Labelled, unlabelled and fully crossed held-out states, the latter in 20 parts by ``layout_seed``."""
+        """Collect labelled, unlabelled and held-out states.
+
+        The held-out states have every combination of features equally often. Their ``layout_seed`` parts them in 20.
+        """
         names = config.factors
         true = names.index(config.truth)
 

@@ -1,4 +1,4 @@
-"""The rooms that an agent chooses among, and the settings that say which feature is rewarded."""
+"""The engine of rooms among which an agent chooses, and the settings that say which feature is rewarded."""
 
 from typing import Self
 
@@ -13,7 +13,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Engine, Plan, Step
 from hypogoal.domains.rooms.states import FACTORS, draw_scenes
 
-DECKS = 64  # sets of rooms of a layout; episodes cycle through them
+DECKS = 64  # the number of sets of rooms of a layout, through which episodes cycle
 
 
 class RoomsConfig(Config):
@@ -32,7 +32,7 @@ class RoomsConfig(Config):
 
     @model_validator(mode="after")
     def _true_is_planted(self) -> Self:
-        """Each feature is planted once, the true one among them."""
+        """Raise ``UserError`` unless each feature is planted once, and the true feature is among them."""
         twice = len({*self.factors}) < len(self.factors)
         if twice or self.truth not in self.factors:
             raise UserError(
@@ -44,12 +44,12 @@ class RoomsConfig(Config):
 
 
 class RoomsEngine(Engine):
-    """Environments of one layout: ``DECKS`` sets of rooms in turn. An action is the room to enter.
+    """Environments of one layout, which show ``DECKS`` sets of rooms in turn. An action is the room to enter.
 
-    Only the right room has the true feature; every other feature is drawn evenly. Entering a room ends the episode,
-    with a reward of 1 if it is the right one. Before the rooms the agent sees a scene in which no feature holds. States
-    are 0 .. DECKS - 1 before the rooms, then the rooms, deck by deck. ``layout_seed`` draws the rooms. An episode has
-    one step, so it is never truncated.
+    Only the right room has the true feature, and every other feature is drawn evenly. Entering a room ends the episode,
+    with a reward of 1 if the room is right. Before the rooms the agent sees a scene in which no feature holds. The
+    states before the rooms are 0 .. DECKS - 1, and the rooms follow, deck by deck. ``layout_seed`` draws the rooms. An
+    episode has one step, so it is never truncated.
     """
 
     resumes = True

@@ -1,4 +1,4 @@
-"""Scenes with planted factors, drawn with MiniGrid's tiles, and the truth of each factor."""
+"""Scenes with planted factors, drawn with MiniGrid's tiles, and whether each factor holds in them."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -20,12 +20,12 @@ MEANINGS = {
     "place": "the object is in the right half",
     "count": "there are three or four boxes",
 }
-INNER = 4  # free cells per side within the walls
-SIDE = (INNER + 2) * TILE  # pixels of an image
+INNER = 4  # free cells on a side within the walls
+SIDE = (INNER + 2) * TILE  # pixels on a side of an image
 CELLS = INNER * INNER
 BOX_COLOURS = ("yellow", "purple", "grey")
-MOST_BOXES = 4  # few: one or two; many: three or four
-# Index of the first tile of each kind.
+MOST_BOXES = 4  # few boxes are one or two, and many boxes are three or four
+# The index of the first tile of each kind.
 FLOOR = 0
 WALL = 1
 AGENT = 2  # plus the direction
@@ -35,15 +35,15 @@ GOAL = 13
 
 
 class Scenes(NamedTuple):
-    """Scenes and which factors hold in them, see ``MEANINGS``."""
+    """N scenes, and which of F factors hold in them. ``MEANINGS`` says what factors mean."""
 
     observations: Bytes  # (N, 48, 48, 3)
-    factors: Bools  # (N, F), the requested ones; others are drawn evenly
+    factors: Bools  # (N, F), the factors that were asked for; the other factors are drawn evenly
 
 
 def labelled_states(count: int, seed: int, names: Sequence[str]) -> Scenes:
-    """The labelled context: every factor holds in half of the states, the positives, and none in the others."""
-    rng = rng_for(seed, "which-feature", "labelled")  # what rooms was called: another name is other states
+    """Draw states of the labelled context. In half of them, the positives, every factor holds, in the others none."""
+    rng = rng_for(seed, "which-feature", "labelled")  # rooms' earlier name, because a new name would change the states
     every_other = np.arange(count) % 2 == 0
     positive = rng.permutation(every_other)
     factors = np.repeat(positive[:, None], len(names), axis=1)
@@ -56,9 +56,10 @@ def unlabelled_states(
     seed: int,
     names: Sequence[str],
 ) -> Scenes:
-    """States without labels.
+    """Draw unlabelled states.
 
-    ``mix`` is the probability that a state's factors are drawn independently and evenly; else all are one even bit.
+    ``mix`` is the probability that a state's factors are drawn independently and evenly. In the other states either all
+    factors hold or none, with equal probability.
     """
     rng = rng_for(seed, "which-feature", "unlabelled")
     independent = rng.random((count, len(names))) < 0.5
@@ -69,7 +70,7 @@ def unlabelled_states(
 
 
 def crossed_states(copies: int, seed: int, names: Sequence[str]) -> Scenes:
-    """Every combination of factors ``copies`` times, in random order."""
+    """Draw states with every combination of factors ``copies`` times, in random order."""
     rng = rng_for(seed, "which-feature", "test")
     combinations = list(product((False, True), repeat=len(names)))
     factors = np.repeat(combinations, copies, axis=0)
@@ -77,7 +78,7 @@ def crossed_states(copies: int, seed: int, names: Sequence[str]) -> Scenes:
 
 
 def draw_scenes(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
-    """Scenes with these factors, bool (N, F); everything else is random and independent of them."""
+    """Draw scenes with ``factors``, bool (N, F). All else is random, and independent of the factors."""
     count = len(factors)
     truth = dict(zip(names, factors.T, strict=True))
     for name in FACTORS:
@@ -94,8 +95,8 @@ def draw_scenes(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
     upwards[y == 0] = False
     upwards[y == INNER - 1] = True
     neighbour = np.where(upwards, y - 1, y + 1)
-    # The cells in the order in which they get their contents: the object's first, one beside it last, so that it
-    # stays free; the others at random.
+    # The order in which cells get their contents. The object's cell is first. A cell beside the object is last, so that
+    # this cell stays free. The other cells are in random order.
     rank = rng.random((count, CELLS))
     cell = y * INNER + x
     beside = neighbour * INNER + x
@@ -121,7 +122,7 @@ def draw_scenes(factors: Bools, names: Sequence[str], rng: Generator) -> Scenes:
 
 
 def draw_pictures(ids: Ints) -> Bytes:
-    """Kinds of tiles (N, 16), row by row -> uint8 (N, 48, 48, 3) with walls around."""
+    """Draw pictures, uint8 (N, 48, 48, 3), of kinds of tiles (N, 16), row by row, with walls around."""
     count = len(ids)
     grid = np.full((count, INNER + 2, INNER + 2), WALL)
     grid[:, 1:-1, 1:-1] = ids.reshape(count, INNER, INNER)
@@ -131,7 +132,7 @@ def draw_pictures(ids: Ints) -> Bytes:
 
 @cache
 def tiles() -> Bytes:
-    """Every kind of tile, uint8 (kinds, 8, 8, 3)."""
+    """Draw every kind of tile, uint8 (kinds, 8, 8, 3)."""
     boxes = [Box(colour) for colour in BOX_COLOURS]
     objects = [
         Key("red"),
