@@ -190,8 +190,8 @@ def run(
 ) -> None:
     """Run every command of an experiment, from nothing to a report.
 
-    --set KEY=VALUE changes a setting of the experiment, and
-    --set STAGE.KEY=VALUE one of a command in it, such as train-meta.
+    --set KEY=VALUE changes a setting of the experiment. --set STAGE.KEY=VALUE
+    changes a setting of a command in it, such as train-meta.
     """
     from hypogoal import look
     from hypogoal.experiments import plan as plans
@@ -246,8 +246,8 @@ def show(
 def verify(path: Made, as_json: Json = False) -> None:
     """Check for missing or changed files. The exit code is 2 if there are any.
 
-    It reads every file, and the inputs that lie within PATH. It names outputs that are
-    still being made, and does not check them.
+    It reads every file, and the inputs that lie within PATH. It names outputs
+    that are still being made, but does not check them.
     """
     from hypogoal import look
 
@@ -316,11 +316,13 @@ def check(
     domain: Annotated[str | None, Argument(help=f"{call.DOMAINS[:-1]}; or a data file, FILE.h5.")] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,
     network: Annotated[str | None, Option(help="A member network: a name or module:function.")] = None,
-    view: Annotated[str | None, Option(help="What members see: module:Class.")] = None,
-    teacher: Annotated[str | None, Option(help="What members are told: module:function.")] = None,
-    chooser: Annotated[str | None, Option(help="Who chooses options: module:Class.")] = None,
-    learner: Annotated[str | None, Option(help="How options learn: module:Class.")] = None,
-    termination: Annotated[str | None, Option(help="When options end: module:Class.")] = None,
+    view: Annotated[str | None, Option(help="A view, which says what members see: module:Class.")] = None,
+    teacher: Annotated[
+        str | None, Option(help="A teacher, which says what members should predict: module:function.")
+    ] = None,
+    chooser: Annotated[str | None, Option(help="A chooser, which picks options: module:Class.")] = None,
+    learner: Annotated[str | None, Option(help="A learner, which trains options: module:Class.")] = None,
+    termination: Annotated[str | None, Option(help="A rule that ends options: module:Class.")] = None,
     set_: stage.Set = None,
     seed: call.Seed = 0,
 ) -> None:
