@@ -378,7 +378,7 @@ def _mean(rows: list[dict[str, str]], quantity: str) -> str:
 
 
 def _steps(rows: list[dict[str, str]]) -> str:
-    """The median steps to 95 of 100 episodes, which count from the first step of practice; never if most do not arrive."""
+    """The median steps to 95 of 100 episodes, those of practice among them; never if most do not arrive."""
     values = [float(row["steps_to_95"] or "inf") for row in rows]
     median = np.median(values)
     return "never" if np.isinf(median) else f"{median:,.0f}"
