@@ -97,7 +97,7 @@ def test_the_verdict_says_after_how_many_episodes() -> None:
         rows += [] if episodes is None else [row("episodes_to_95", episodes, method=SEVERAL, **place)]
     _, told, *_ = sentences(results_of(*rows, agents={SEVERAL: LEARNED}))
     assert told.startswith("The reward told the agent what to do within 40 episodes, the median of its runs,")
-    assert "It came so far in 75 % of its runs. So expect" in told
+    assert told.endswith("It came so far in 75 % of its runs."), "four layouts are too few to expect it of others"
 
 
 def test_the_verdict_says_that_the_reward_has_not_told() -> None:
@@ -112,8 +112,8 @@ def test_the_verdict_says_that_the_reward_has_not_told() -> None:
 @pytest.mark.parametrize(
     ("better", "said"),
     [
-        (0.55, "between hypotheses, and you cannot trust the member that it prefers."),
-        (0.9, "you can trust the member that it prefers."),
+        (0.55, "not between hypotheses, and its preference does not tell which member is better."),
+        (0.9, "the member that it prefers is likely the better one."),
     ],
 )
 def test_choosing_sub_goals_is_told_from_choosing_among_members(better: float, said: str) -> None:
