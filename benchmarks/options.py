@@ -25,7 +25,7 @@ from numpy.typing import NDArray  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
 from hypogoal.core.config import assigned, resolve  # noqa: E402
-from hypogoal.core.config import preset as read_preset  # noqa: E402
+from hypogoal.core.presets import preset as read_preset  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.core.seeding import rng_for  # noqa: E402
 from hypogoal.domains.doorkey.engine import DoorKeyEngine  # noqa: E402

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import hypogoal
 from hypogoal.command.stage import Stage
-from hypogoal.core.config import MODELS, described, model_of
+from hypogoal.core.config import MODELS, model_of
+from hypogoal.core.presets import described
 
 STUB = Path(hypogoal.__file__).with_suffix(".pyi")
 STAGES = ("collect", "evaluate", "report", "train_baseline", "train_ensemble", "train_meta", "train_options")

@@ -96,7 +96,7 @@ def command_line() -> str:
 
 def settings() -> str:
     """What ``hypogoal config`` says of every stage: a table a stage, a column for each domain's default."""
-    from hypogoal.core.config import TABLES
+    from hypogoal.core.presets import TABLES
     from hypogoal.domains.base import BUILT_IN
 
     lines = [
@@ -118,7 +118,7 @@ def settings() -> str:
 
 def settings_of(stage: str) -> list[dict[str, Any]]:
     """The settings of a stage, each by the domains that have it. What means something else elsewhere is another one."""
-    from hypogoal.core.config import described
+    from hypogoal.core.presets import described
     from hypogoal.domains.base import BUILT_IN, layers_of
     from hypogoal.experiments.experiment import config_class_of
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, Field, TypeAdapter
 
-from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import ANEW
+from hypogoal.core.drafts import Draft
 from hypogoal.core.files import reading
 
 PLAN = "sweep.json"

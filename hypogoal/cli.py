@@ -283,12 +283,12 @@ def config(
     as_json: Json = False,
 ) -> None:
     """List every setting of a stage, with default, unit, meaning and source."""
-    from hypogoal.core import config as settings
+    from hypogoal.core import presets
     from hypogoal.domains import base as domains
     from hypogoal.experiments.experiment import config_class_of
 
-    rows = settings.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))
-    echo(rows, as_json, [settings.as_toml(stage, rows)] if toml else _setting_lines(rows))
+    rows = presets.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))
+    echo(rows, as_json, [presets.as_toml(stage, rows)] if toml else _setting_lines(rows))
 
 
 def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:

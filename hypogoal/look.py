@@ -9,7 +9,8 @@ from statistics import fmean
 from typing import Any
 
 from hypogoal.cells import read_plan, status_lines
-from hypogoal.core.artefacts import LOG, MANIFEST, SUMMARY, Artefact, Draft, open_artefact
+from hypogoal.core.artefacts import LOG, MANIFEST, SUMMARY, Artefact, open_artefact
+from hypogoal.core.drafts import Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import read_log, reading, visible
 from hypogoal.core.progress import say

@@ -80,7 +80,8 @@ def test_the_widest_tables_fit_a_narrow_window(site: Path, name: str) -> None:
 def test_the_reference_is_that_of_the_code(site: Path) -> None:
     """Every command and every setting of every stage is in the reference, and every page is there."""
     from hypogoal.cli import commands as made_commands
-    from hypogoal.core.config import STAGES, described
+    from hypogoal.core.config import STAGES
+    from hypogoal.core.presets import described
     from hypogoal.experiments.experiment import config_class_of
 
     assert len(list(site.rglob("*.html"))) >= 15

@@ -10,7 +10,7 @@ import pytest
 from command_line import fails, refuses, run
 from toy_data import files_of
 
-from hypogoal.core.artefacts import create
+from hypogoal.core.drafts import create
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.evaluation.run import find_artefacts
 from hypogoal.look import describe, faults, lines, outcome, stale

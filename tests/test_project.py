@@ -19,7 +19,7 @@ from test_docs import blocks
 from toy_data import write
 
 import hypogoal
-from hypogoal.core.artefacts import create
+from hypogoal.core.drafts import create
 from hypogoal.core.seeding import torch_generator
 from hypogoal.data import open_dataset
 from hypogoal.domains.base import load_domain

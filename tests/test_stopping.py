@@ -17,8 +17,8 @@ from option_loops import loop_of, played
 from torch import Tensor
 from toy_data import write
 
-from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import PACE
+from hypogoal.core.drafts import Draft
 from hypogoal.core.errors import NumericalError
 from hypogoal.core.files import replace_text
 from hypogoal.core.tensors import save_tensors

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from hypogoal.core.artefacts import LOG, MANIFEST, create
+from hypogoal.core.artefacts import LOG, MANIFEST
+from hypogoal.core.drafts import create
 from hypogoal.core.tensors import save_tensors
 from hypogoal.data import Collected, States, create_hdf5, write_dataset
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble

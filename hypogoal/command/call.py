@@ -12,8 +12,8 @@ from typer import Option
 from hypogoal.core.progress import MetricsLog, Progress
 
 if TYPE_CHECKING:
-    from hypogoal.core.artefacts import Draft
     from hypogoal.core.config import C
+    from hypogoal.core.drafts import Draft
 
 Place = str | os.PathLike[str]
 DOMAINS = "doorkey, montezuma, rooms, or your own as module:object."
@@ -62,8 +62,8 @@ class Call:
         config: Mapping[str, Any],
         inputs: Sequence[Path] = (),
     ) -> contextlib.AbstractContextManager["Draft"]:
-        """Return the output to fill, see :func:`hypogoal.core.artefacts.create`."""
-        from hypogoal.core.artefacts import create
+        """Return the output to fill, see :func:`hypogoal.core.drafts.create`."""
+        from hypogoal.core.drafts import create
 
         return create(
             self.out,

@@ -145,7 +145,8 @@ class Stage:
 
     def _settings(self) -> Iterator[Parameter]:
         """Yield ``--set``, and the options that are short for it. Their values stay text, which is read later."""
-        from hypogoal.core.config import described, model_of
+        from hypogoal.core.config import model_of
+        from hypogoal.core.presets import described
 
         if "preset" in self.leaves_out:
             return

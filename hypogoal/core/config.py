@@ -6,16 +6,12 @@ flat all the same: on the command line, in presets, in manifests.
 """
 
 import difflib
-import inspect
-import json
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import inf
-from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Self, TypeVar, Union, get_args, get_origin
+from typing import Any, Self, TypeVar, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -28,12 +24,10 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import reading
 
 C = TypeVar("C", bound="Config")
 Values = Mapping[str, Any]  # values of settings, by name
 DOMAIN = "doorkey"  # the domain whose presets and defaults hold if no domain is named
-PRESETS = Path(__file__).parents[1] / "presets"
 MODELS = {  # by stage, except collect, whose model is its domain's, and run, whose model is its experiment's
     "train-ensemble": "hypogoal.hypotheses.config:TrainEnsembleConfig",
     "train-options": "hypogoal.meta.config:TrainOptionsConfig",
@@ -42,7 +36,6 @@ MODELS = {  # by stage, except collect, whose model is its domain's, and run, wh
     "audit": "hypogoal.meta.config:AuditConfig",
 }
 STAGES = ("collect", *MODELS)
-TABLES = (*STAGES, "run")  # the tables that a preset may have
 OWN = "module:object"  # stands for any name of a user's own code, among choices and parts
 MOST = 10_000  # the largest number of integers that one range may stand for
 
@@ -85,7 +78,7 @@ class Config(BaseModel):
             return as_field(raw)
         value = as_field(_typed(raw, field.annotation))
         for item in value if isinstance(value, tuple) else (value,):
-            if not _details(field).allow(item):
+            if not details_of(field).allow(item):
                 raise ValueError("value not allowed")
         return value
 
@@ -206,32 +199,6 @@ def integers(text: str) -> list[int]:
         raise UserError("not integers", repr(text[:200]), "Write them as 0-3,7.") from None
 
 
-def preset(name: str | None, stage: str, domain: str = DOMAIN) -> dict[str, Any]:
-    """Return the table ``[stage]`` of the preset ``name``, which is empty if there is no such table.
-
-    ``name`` is a preset of the package or a TOML file. Presets of the package are those of ``domain``, or of DoorKey if
-    the domain has none. Raises ``UserError`` if there is no such preset, or if it has a table of another name than a
-    stage's.
-    """
-    if name is None:
-        return {}
-    folder = PRESETS / domain
-    if not folder.is_dir():
-        folder = PRESETS / DOMAIN
-    path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
-    if not path.exists():
-        names = sorted(file.stem for file in folder.iterdir())
-        raise UserError("no such preset", name, f"Choose one of {', '.join(names)}, or give a .toml file.")
-    with reading(path, "Mend the file.", "the preset"):
-        text = path.read_text(encoding="utf-8-sig")
-        tables = tomllib.loads(text)
-    for key, table in tables.items():
-        if key not in TABLES or not isinstance(table, dict):
-            do = f"A preset has tables for {', '.join(TABLES)}."
-            raise UserError("no such table in a preset", f"{key} in {name}", do)
-    return dict(tables.get(stage, {}))
-
-
 def resolve(model: type[C], *layers: Values, stage: str) -> C:
     """Return the settings of ``stage``: the model, and the parts that its settings choose. Later layers win.
 
@@ -252,11 +219,11 @@ def resolve(model: type[C], *layers: Values, stage: str) -> C:
                 raise UserError(fault, name, f"See 'hypogoal config {stage}'.")
         if chosen:
             of_part = {name: value for name, value in part_values.items() if name in names}
-            values[field] = _validated(chosen, of_part, model, stage)
-    return _validated(model, values, model, stage)
+            values[field] = validated(chosen, of_part, model, stage)
+    return validated(model, values, model, stage)
 
 
-def _validated(kind: type[C], values: Values, model: type[Config], stage: str) -> C:
+def validated(kind: type[C], values: Values, model: type[Config], stage: str) -> C:
     """Return settings of this kind, which is ``model`` itself or a part of it.
 
     Raises ``UserError`` if a value is not allowed.
@@ -286,48 +253,6 @@ def known(model: type[Config], values: Values) -> dict[str, Any]:
     Files of earlier versions may have other names, which are left out.
     """
     return {name: values[name] for name in names_of(model) if name in values}
-
-
-def described(model: type[Config], *layers: tuple[Values, str]) -> list[dict[str, Any]]:
-    """Return a description of every setting of the model, then of its parts.
-
-    A layer has values that replace defaults, and the source of these values.
-    """
-    replacing: dict[str, Any] = {}
-    sources: dict[str, str] = {}
-    for values, source in layers:
-        replacing |= {name: value for name, value in values.items() if value is not None}
-        sources |= dict.fromkeys(values, source)
-    rows = {}
-    for home in homes_of(model):
-        of_home = {name: value for name, value in replacing.items() if name in home.model_fields}
-        defaults = _validated(home, of_home, model, "").model_dump(mode="json")
-        for origin in home.__mro__:
-            for name in inspect.get_annotations(origin):
-                field = home.model_fields.get(name)
-                if field is None or name in rows or name in parts_of(home):
-                    continue
-                details = _details(field)
-                rows[name] = {
-                    "name": name,
-                    "type": _type_text(field.annotation),
-                    "default": defaults[name],
-                    "unit": details.unit,
-                    "meaning": field.description or "",
-                    "source": sources.get(name, details.source),
-                    "allowed": str(details),
-                    "part": (origin.__doc__ or "").partition(".")[0],
-                }
-    return [*rows.values()]
-
-
-def as_toml(stage: str, rows: Iterable[Values]) -> str:
-    """Return settings, as :func:`described` gives them, as the text of a preset that the user can edit."""
-    lines = [f"[{stage}]"]
-    for row in rows:
-        value = json.dumps(row["default"], ensure_ascii=False)
-        lines.append(f"{row['name']} = {value}  # {row['meaning']}")
-    return "\n".join(lines) + "\n"
 
 
 def _typed(raw: Any, kind: Any) -> Any:
@@ -366,15 +291,8 @@ def _items(text: str, kind: Any) -> list[Any]:
     return numbers
 
 
-def _type_text(kind: Any) -> str:
-    """Return a setting's type as a text: ``float``, ``tuple[int, ...]``, ``float|auto``."""
-    if get_origin(kind) is not Union:
-        return getattr(kind, "__name__", str(kind))
-    number, words = get_args(kind)
-    return "|".join([number.__name__, *get_args(words)])
-
-
-def _details(field: FieldInfo) -> Details:
+def details_of(field: FieldInfo) -> Details:
+    """Return what :func:`setting` said of a field."""
     extra: Any = field.json_schema_extra or {}
     return extra.get("details", Details())
 
@@ -388,7 +306,7 @@ def _refusal(kind: type[Config], model: type[Config], error: ValidationError, st
     name = str(fault["loc"][0])
     advice = f"See 'hypogoal config {stage}'."
     if name in kind.model_fields:
-        allowed = str(_details(kind.model_fields[name]))
+        allowed = str(details_of(kind.model_fields[name]))
         where = f"{name}={fault['input']!r:.200} in {stage}"
         do = f"Allowed: {allowed}." if allowed else advice
         return UserError(fault["msg"].removeprefix("Value error, "), where, do)

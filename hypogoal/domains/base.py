@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from hypogoal.core import own_code
 from hypogoal.core.arrays import Bools, Bytes, Doubles, Floats, Ints
 from hypogoal.core.checkpoints import Resumable, State
-from hypogoal.core.config import C, Values, model_of, preset, resolve
+from hypogoal.core.config import C, Values, model_of, resolve
 from hypogoal.core.errors import UserError
+from hypogoal.core.presets import preset
 from hypogoal.data import Collected
 from hypogoal.observations import PICTURE, DType, Observations, Shape, Standard
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hypogoal.core.artefacts import Draft
+from hypogoal.core.drafts import Draft
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import prepare
 from hypogoal.core.progress import MetricsLog, Progress, say

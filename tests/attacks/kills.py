@@ -20,8 +20,9 @@ import time
 from importlib import import_module
 from pathlib import Path
 
-from hypogoal.core.artefacts import Artefact, Draft
+from hypogoal.core.artefacts import Artefact
 from hypogoal.core.checkpoints import PACE
+from hypogoal.core.drafts import Draft
 
 PACES = ("0", "0.02", "0.2")  # seconds between two checkpoints; 0: at every step
 QUICK = "--set warm_up=100 --set max_episode_steps=60 --set environments=8"

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 from toy_data import reseal
 
-from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, Draft, create, open_artefact
+from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, open_artefact
+from hypogoal.core.drafts import Draft, create
 from hypogoal.core.errors import Complete, UserError
 from hypogoal.data import create_hdf5
 from hypogoal.evaluation.run import find_artefacts
@@ -159,7 +160,7 @@ def test_other_versions_and_damaged_drafts_are_not_continued(tmp_path: Path, mon
     with pytest.raises(KeyError):
         stop(out, KeyError(), config={"workers": 4})
     with monkeypatch.context() as patch:
-        patch.setattr("hypogoal.core.artefacts.versions", lambda: {"torch": "9.9"})
+        patch.setattr("hypogoal.core.drafts.versions", lambda: {"torch": "9.9"})
         with pytest.raises(UserError, match="begun with torch="):
             finish(out, resume=True)
     begun = Draft(out).begun.read_text()
@@ -241,7 +242,7 @@ def test_a_data_file_is_renamed_when_whole(tmp_path: Path) -> None:
 HOLD = """
 import sys, signal
 from pathlib import Path
-from hypogoal.core.artefacts import create
+from hypogoal.core.drafts import create
 with create(Path(sys.argv[1]), kind="meta", config={}, seed=0) as draft:
     print("begun", flush=True)
     signal.pause()

@@ -11,20 +11,17 @@ from hypogoal.core.config import (
     MODELS,
     OWN,
     STAGES,
-    TABLES,
     Config,
-    as_toml,
     assigned,
-    described,
     integers,
     known,
     model_of,
     part,
-    preset,
     resolve,
     setting,
 )
 from hypogoal.core.errors import UserError
+from hypogoal.core.presets import TABLES, as_toml, described, preset
 from hypogoal.domains.base import settings_of
 from hypogoal.domains.doorkey.domain import DoorKeyConfig
 from hypogoal.experiments.experiment import config_class_of

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from toy_data import fill, write_table
 
-from hypogoal.core.artefacts import create
+from hypogoal.core.drafts import create
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.data import Collected, States, write_dataset
 from hypogoal.domains.base import Domain

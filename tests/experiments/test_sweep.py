@@ -17,7 +17,7 @@ from command_line import fails, refuses, run
 from toy import DATA, PLAY, SMALL, write_toy
 
 from hypogoal.cells import Cell, read_plan, status_lines
-from hypogoal.core.artefacts import Draft
+from hypogoal.core.drafts import Draft
 from hypogoal.experiments.plan import plan
 from hypogoal.experiments.run import PRELOADED, begin, run_local
 

@@ -15,10 +15,11 @@ import hypogoal
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.checkpoints import Checkpoints
 from hypogoal.hypotheses import auto
-from hypogoal.hypotheses.auto import WEIGHTS, AutoTraining, held_out, information_of, lowest_kept
+from hypogoal.hypotheses.auto import AutoTraining
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.scores import idle_members, mean_disagreement
 from hypogoal.hypotheses.views import StateOrigins
+from hypogoal.hypotheses.weights import WEIGHTS, held_out, information_of, lowest_kept
 
 AUTO = TrainEnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, restarts=2)
 HALF = np.arange(64) % 2 == 0

@@ -7,8 +7,8 @@ import torch
 from breaking import Breaking, Broken
 from test_training import assert_same, toy
 
-from hypogoal.core.artefacts import Draft
 from hypogoal.core.checkpoints import Checkpoints
+from hypogoal.core.drafts import Draft
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.training import EnsembleTraining
 from hypogoal.stages.train_ensemble import train_ensemble

@@ -9,7 +9,8 @@ import pytest
 from command_line import refuses, run
 from toy_data import fill, reseal, write_table
 
-from hypogoal.core.artefacts import Artefact, create, open_artefact, sha256_of
+from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
+from hypogoal.core.drafts import create
 from hypogoal.evaluation.statistics import pairs
 from hypogoal.stages.evaluate import evaluate
 from hypogoal.tools.beside import labels_of, winners
