@@ -2,12 +2,11 @@
 
 Each network is an ``nn.Sequential`` from :func:`inputs_of`, for pictures float (N, C, H, W) in 0..1, to logits (N, 2),
 with "positive" in column 1. Built-in networks consist of plain modules, each used once, with each ReLU before its
-MaxPool, because DeepLift is valid for such networks only. :func:`reordered` gives an order that is faster to train. A
-user's network may begin with any module, an encoder.
+MaxPool, because DeepLift is valid for such networks only. :func:`reordered` gives a faster order. A user's network may
+begin with any module, an encoder.
 
-The paper states the number and kinds of layers, but not their sizes. The sizes come from the authors' public code
-(github.com/AnitadeMelloKoch/portable_options, portable/option/divdis/models). The dropout of 0.1 in DoorKey's network
-there is left out, because the paper does not have it.
+The paper has no sizes of layers. They come from the authors' public code (github.com/AnitadeMelloKoch/portable_options,
+portable/option/divdis/models), without its dropout of 0.1 in DoorKey's network, which the paper does not have.
 """
 
 import inspect
@@ -280,10 +279,7 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
 
 
 def folded(network: nn.Sequential) -> nn.Sequential:
-    """Return a network of the same function in evaluation mode, with BatchNorm folded into convolutions.
-
-    Each BatchNorm is folded into a copy of the convolution before it.
-    """
+    """Return a network of the same function in evaluation mode, with each BatchNorm folded into a convolution's copy."""
     layers: list[nn.Module] = []
     for layer in network:
         before = layers[-1] if layers else None

@@ -13,20 +13,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from hypogoal.core.arrays import Array, Bytes, Ints
+from hypogoal.hypotheses.distinct import Ids, distinct_items, join, positions, rank
 from hypogoal.observations import spread_rows
 
-Ids = NDArray[np.int32]  # numbers of patches, rows or colours
 # If distinct patches need more than this share of the plain network's work in convolutions, gathering patches costs
 # more than it saves.
 WORTHWHILE = 0.5
 SAMPLE = 64  # the number of images of each part from which the share of work is estimated
 SAMPLE_PIXELS = 2**19  # the images of a sample have at most this number of pixels, because each takes some 250 bytes
-LOOKUP_PER_VALUE = 4  # sorting is faster than a table with more than this number of entries per value to rank
 
 
 @dataclass(frozen=True)
@@ -136,22 +134,22 @@ def tables_of(
     of rows, then strips in bands.
     """
     count, height, width, channels = observations.shape
-    lines, pixel_rows = _distinct_items(
+    lines, pixel_rows = distinct_items(
         observations.reshape(
             count * height,
             width * channels,
         )
     )
     lines = lines.reshape(count, height)
-    rows, colours = _distinct_items(pixel_rows.reshape(-1, channels))
+    rows, colours = distinct_items(pixel_rows.reshape(-1, channels))
     rows = rows.reshape(-1, width)
     distinct = len(colours)
     levels = []
     for kernel, stride in windows:
-        strip_rows, strips = _join(_strided(rows, kernel, stride), distinct)
-        lines, bands = _join(_strided(lines, kernel, stride), len(rows))
+        strip_rows, strips = join(_strided(rows, kernel, stride), distinct)
+        lines, bands = join(_strided(lines, kernel, stride), len(rows))
         in_bands = [strip_rows[bands[:, row]] for row in range(kernel)]
-        rows, stacks = _join(in_bands, len(strips))
+        rows, stacks = join(in_bands, len(strips))
         parts = strips[stacks].reshape(len(stacks), -1)
         levels.append(Level(parts, rows, lines))
         distinct = len(parts)
@@ -170,53 +168,6 @@ def _strided(values: Ids, kernel: int, stride: int) -> list[Ids]:
     return [values[..., offset : after + offset : stride] for offset in range(kernel)]
 
 
-def _join(pieces: Sequence[Ids], bound: int) -> tuple[Ids, Ids]:
-    """Join arrays of ids below ``bound``, place by place, into tuples.
-
-    Returns the distinct tuples' ids in the shape of the arrays, and the distinct tuples.
-    """
-    ids = pieces[0]
-    tuples = np.arange(bound, dtype=np.int32)[:, None]
-    for piece in pieces[1:]:
-        pairs = ids.astype(int) * bound + piece
-        ids, distinct = _rank(pairs, len(tuples) * bound)
-        before, last = np.divmod(distinct, bound)
-        joined = last.astype(np.int32)
-        tuples = np.column_stack([tuples[before], joined])
-    return ids, tuples
-
-
-def _rank(values: Ids | Ints, bound: int) -> tuple[Ids, Ints]:
-    """Return the ranks of values in 0..bound-1 among the distinct values, and the distinct values in order."""
-    if bound > LOOKUP_PER_VALUE * values.size:
-        ordered, inverse = np.unique(values, return_inverse=True)
-        whole = inverse.reshape(values.shape)
-        return whole.astype(np.int32), ordered.astype(int)
-    occurs = np.zeros(bound, bool)
-    occurs[values] = True
-    ranks = np.cumsum(occurs, dtype=np.int32) - 1
-    return ranks[values], np.flatnonzero(occurs)
-
-
-def _distinct_items(items: Bytes) -> tuple[Ids, Bytes]:
-    """Return the indices of distinct items (N,) and the distinct items, in order of appearance.
-
-    ``items`` are bytes (N, size).
-    """
-    size = items.shape[1]
-    together = np.ascontiguousarray(items).view(f"V{size}")
-    whole = together.ravel().tolist()
-    index_of = {item: index for index, item in enumerate(dict.fromkeys(whole))}
-    index = np.fromiter(
-        map(index_of.__getitem__, whole),
-        np.int32,
-        len(whole),
-    )
-    joined = b"".join(index_of)
-    distinct = np.frombuffer(joined, np.uint8)
-    return index, distinct.reshape(-1, size)
-
-
 def take(tables: Tables, *groups: Ints) -> PatchBatch:
     """Return the patches of groups of images, given by index (B,).
 
@@ -232,12 +183,12 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
         for number, level in enumerate(tables.levels):
             rows = level.lines[images]
             ids = level.rows[rows]
-            ranks, occurring = _rank(ids, len(level.parts))
+            ranks, occurring = rank(ids, len(level.parts))
             counts = np.bincount(ranks.ravel())
             share = counts / ids.size
             of_group = torch.from_numpy(share.astype(np.float32))
             shares[number].append((of_group[None], ids.size))
-            below = _positions(level.parts[occurring], used)
+            below = positions(level.parts[occurring], used)
             parts[number].append(below + offset)
             used, offset = occurring, before[number]
             before[number] += len(occurring)
@@ -249,14 +200,6 @@ def take(tables: Tables, *groups: Ints) -> PatchBatch:
         shares,
         torch.from_numpy(np.concatenate(last)),
     )
-
-
-def _positions(values: Ids, among: Ints) -> Ints:
-    """Return the index of each value in the sorted array ``among``, which contains all of the values."""
-    size = int(among[-1]) + 1
-    position = np.empty(size, int)
-    position[among] = np.arange(len(among))
-    return position[values]
 
 
 def forward(
