@@ -279,7 +279,7 @@ def reordered(network: nn.Sequential) -> nn.Sequential:
 
 
 def folded(network: nn.Sequential) -> nn.Sequential:
-    """Return a network of the same function in evaluation mode, with each BatchNorm folded into a convolution's copy."""
+    """Return a network of the same function in evaluation mode, with each BatchNorm folded into a convolution."""
     layers: list[nn.Module] = []
     for layer in network:
         before = layers[-1] if layers else None
