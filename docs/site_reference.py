@@ -86,7 +86,8 @@ def command_line() -> str:
     import typer
     from typer.cli import get_docs_for_click
 
-    from hypogoal.cli import app, commands
+    from hypogoal.cli import commands
+    from hypogoal.command.app import app
 
     command: Any = typer.main.get_command(app)
     command.commands = commands()
