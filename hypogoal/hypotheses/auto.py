@@ -15,15 +15,13 @@ That is at most 1/2 if neither rule says yes to more than half of the states.
 
 The first member of a sequential ensemble is trained on the labels alone, once for all weights. If the first member
 mixes features, later members can only mix what is left. So ``restarts`` first members begin training. After the share
-``EARLY`` of the steps, only the member whose predictions tell most about unlabelled states goes on. What predictions
-tell is the mutual information of state and prediction, H(mean p) - mean H(p) (Bridle et al. 1991). The mutual
-information is low for a mixture, because a mixture is in doubt where its features part, or says no to most states.
-Members that are trained at once end in different mixtures. So ``restarts`` whole ensembles are trained, and the
-ensemble that tells most is kept.
+``EARLY`` of the steps, only the member whose predictions tell most about unlabelled states goes on, see
+:func:`hypogoal.hypotheses.weights.information_of`. Members that are trained at once end in different mixtures. So
+``restarts`` whole ensembles are trained, and the ensemble that tells most is kept.
 """
 
 from collections.abc import Generator, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from math import inf, isnan, sqrt
 from operator import itemgetter
 from typing import Any
@@ -42,25 +40,13 @@ from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
 from hypogoal.hypotheses.fit import Losses
 from hypogoal.hypotheses.training import EnsembleTraining, require_unlabelled
 from hypogoal.hypotheses.views import StateOrigins
-from hypogoal.hypotheses.weights import WEIGHTS, accuracies_of, held_out, information_of, lowest_kept
+from hypogoal.hypotheses.weights import WEIGHTS, Tried, accuracies_of, held_out, information_of, lowest_kept
 from hypogoal.observations import Observations
 
 HALF = 0.5
 EARLY = 1 / 3  # the share of its steps after which a first member is compared with the other restarts
 
 Outcome = Generator[Losses, None, State]  # one training: it yields the losses of each step and returns its outcome
-
-
-@dataclass(frozen=True)
-class Tried:
-    """Result of one tried weight: the worst member's held-out accuracy, and how members differ on unlabelled states."""
-
-    weight: float
-    accuracy: float
-    disagreement: float | None  # None if there is one member
-    constant: bool  # some member predicts one class for all unlabelled states
-    contrary: bool  # members differ on more than half of the unlabelled states
-    kept: bool
 
 
 class AutoTraining:

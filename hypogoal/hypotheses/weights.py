@@ -11,6 +11,7 @@ Of the ``n_c`` held-out states of class c, ``right_c`` are predicted right witho
 succession, because with the plain share a member without a fault would have s = 0.
 """
 
+from dataclasses import dataclass
 from math import sqrt
 from typing import Any
 
@@ -28,6 +29,18 @@ FEWEST = 8
 SMALL = 1e-9  # probabilities are raised to this at least, because log 0 is not finite
 FEW = "{} labels of a class are too few to choose the diversity weight by, so it is {}"
 SINGLE = "too few groups have both classes, so single states are held out: near copies make them easy"
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Result of one tried weight: the worst member's held-out accuracy, and how members differ on unlabelled states."""
+
+    weight: float
+    accuracy: float
+    disagreement: float | None  # None if there is one member
+    constant: bool  # some member predicts one class for all unlabelled states
+    contrary: bool  # members differ on more than half of the unlabelled states
+    kept: bool
 
 
 def held_out(labels: Bools, groups: Ints | None, seed: int) -> tuple[list[Bools], str]:
@@ -84,7 +97,11 @@ def lowest_kept(right: Bools, labels: Bools) -> float:
 
 
 def information_of(probabilities: Floats) -> float:
-    """Return the mutual information of state and prediction, in nats, from a member's probabilities (M,)."""
+    """Return the mutual information of state and prediction, in nats, from a member's probabilities (M,).
+
+    It is H(mean p) - mean H(p) (Bridle et al. 1991). It is low for a mixture, because a mixture is in doubt where its
+    features part, or says no to most states.
+    """
 
     def entropy(positive: Any) -> Any:
         both = np.clip(np.stack([positive, 1 - positive]), SMALL, 1)
