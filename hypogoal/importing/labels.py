@@ -13,7 +13,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.own_code import load
 from hypogoal.data import Collected, joined, open_dataset, write_dataset
-from hypogoal.importing.states import UNLABELLED, Frames
+from hypogoal.importing.states import HELDOUT, UNJUDGED, UNLABELLED, Frames
 from hypogoal.observations import NUMBERS, digest
 
 LAST, TABLE = "last:", ".csv"  # the beginning of a rule for last frames, and the end of a rule that names a table
@@ -28,12 +28,14 @@ def labels_of(frames: Frames, rules: Mapping[str, str]) -> Bools:
     ``rules`` are, by sub-goal, one of four texts. The name of a column means the frames in which the column is above 0.
     ``last:N`` means the last N frames of each success. ``FILE.csv`` is a table of positive frames. ``module:function``
     is asked about each observation, which is a dictionary if there are several keys. Frames of which a rule knows
-    nothing, such as those of episodes that a table does not list, become unlabelled.
+    nothing, such as those of episodes that a table does not list, become unlabelled, or unjudged if they are held out.
     """
     marks = [_marks(frames, rule) for rule in rules.values()]
     labels = np.stack(marks, axis=1)
     is_unknown = np.isnan(labels).any(axis=1)
-    frames.table.loc[is_unknown, "role"] = UNLABELLED
+    is_held = frames.table["role"] == HELDOUT
+    frames.table.loc[is_unknown & ~is_held, "role"] = UNLABELLED
+    frames.table.loc[is_unknown & is_held, "role"] = UNJUDGED
     return labels > 0
 
 

@@ -255,6 +255,20 @@ def test_padded_names_are_held_out_and_unknown_success_is_unlabelled(tmp_path: P
         assert label is None or state[0] != 1
 
 
+def test_held_out_demonstrations_without_labels_are_left_out(tmp_path: Path) -> None:
+    """They are not trained on, and the others are divided as if they were not there."""
+    source = small_robomimic(tmp_path / "x.hdf5", put("mask/valid", [b"demo_0", b"demo_5"]))
+    table = tmp_path / "labels.csv"
+    spans = [f"demo_{demo},3,5" for demo in range(5)]
+    table.write_text("\n".join(["episode,from,to", *spans]))
+    said = run("import", source, "--out", tmp_path / "data.h5", "--label", f"on={table}", "-q").err
+    assert "hypogoal: 5 held-out states have no label: they are left out\n" in said
+    data = open_dataset(tmp_path / "data.h5")
+    assert {state[0] for state in data.heldout("on").observations} == {0}
+    assert len(data.labelled("on").labels) == len(data.unlabelled()) == 10
+    assert {state[0] for state, _ in frames_of(data, "on")} == {0, 1, 2, 3, 4}
+
+
 def test_minari_is_read(tmp_path: Path) -> None:
     """Spec B6: whole episodes are labelled, unlabelled or held out, the same for the same seed."""
     folder, data = save_minari(tmp_path / "own-v0"), tmp_path / "data.h5"
