@@ -330,7 +330,7 @@ class Dataset:
         for key, (kind, shape) in fields_of(self.observation_shape, self.observation_dtype).items():
             size = prod(shape) if kind == NUMBERS else 1
             numbered = [f"{key or 'x'}[{place}]" for place in range(size)]
-            names += numbered if size > 1 else [key]
+            names += [key] if key and size == 1 else numbered
         return names
 
     def labelled(self, sub_goal: str) -> States:

@@ -71,6 +71,14 @@ def test_what_is_not_written(tmp_path: Path, name: str, labels: list[Any], words
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.parametrize("shape", [(1,), (), (1, 1)])
+def test_a_single_number_has_a_name(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    states = States(np.zeros((2, *shape), np.float32), np.array([True, False]))
+    collected = Collected(shape, ("one",), states, states, states)
+    write_dataset(tmp_path / "data.h5", collected, domain="", config={}, seed=0)
+    assert open_dataset(tmp_path / "data.h5").features() == ["x[0]"]
+
+
 def attribute(name: str, value: Any) -> Damage:
     def damage(file: h5py.File) -> None:
         file.attrs[name] = fixed(value) if isinstance(value, str) else value
