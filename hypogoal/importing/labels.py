@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -108,22 +109,28 @@ def add_labels(source: Path, file: Path, sub_goal: str, path: Path, seed: int) -
     """Write the states of the data file ``source`` to ``file``, with labels for the states in the table at ``path``.
 
     ``audit`` proposes the table beside pictures of the states, and a person or a script fills it in. Returns a line on
-    how many states are labelled. Raises ``UserError`` if the table is of other data or names a state twice, or if the
-    data have several sub-goals.
+    how many states are labelled. States that equal a state in the table get that state's label, too. Raises
+    ``UserError`` if the table is of other data or names a state twice, or if the data have several sub-goals.
     """
     dataset = open_dataset(source)
     if dataset.sub_goals != (sub_goal,):
         goals = ", ".join(dataset.sub_goals)
         raise UserError("a table labels data of one sub-goal, its own", sub_goal, f"It has {goals}.")
     unlabelled = dataset.unlabelled_states()
-    places = {digest(state).hex(): place for place, state in enumerate(unlabelled.observations)}
+    places: dict[str, list[int]] = {}
+    for place, state in enumerate(unlabelled.observations):
+        look = digest(state).hex()
+        alike = places.setdefault(look, [])
+        alike.append(place)
     table = read_table(path, {"label": str, "digest": str})
     filled = table[table["label"] != ""]
     with reading(path, "Give states of these data, each once, with 1 or 0; or audit an ensemble of these data again."):
-        numbers = [places.pop(look) for look in filled["digest"]]
+        copies = [places.pop(look) for look in filled["digest"]]
         labels = [TRUTHS[label] for label in filled["label"]]
-    rows = np.array(numbers, int)
-    marked = replace(unlabelled.where(rows), labels=np.array(labels, bool))
+    rows = np.array([*chain(*copies)], int)
+    counts = np.array([*map(len, copies)], int)
+    of_each = np.repeat(np.array(labels, bool), counts)
+    marked = replace(unlabelled.where(rows), labels=of_each)
     every = np.arange(len(unlabelled.labels))
     others = np.delete(every, rows)
     features: Sequence[str] = ()
