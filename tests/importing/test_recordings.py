@@ -10,6 +10,8 @@ from typing import Any, TypeAlias
 import h5py
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from command_line import refuses, run
 
@@ -378,6 +380,19 @@ def test_a_damaged_dataset_is_one_line(datasets: Path, tmp_path: Path, damage: C
     damage(source)
     keys = ["--key", TOP, "--key", WRIST, "--key", STATE]
     refuses(words, "import", source, "--out", tmp_path / "data.h5", *LABEL, *keys)
+
+
+def test_pictures_in_files_of_their_own_are_one_line(datasets: Path, tmp_path: Path) -> None:
+    """Spec G2: a table that has paths in place of bytes."""
+    source = tmp_path / "source"
+    shutil.copytree(datasets / "v3.0-image", source)
+    frames = pq.read_table(source / TABLE)
+    kind = frames.schema.field(TOP).type
+    paths = pa.array([{"bytes": None, "path": "images/frame-0.png"}] * len(frames), kind)
+    column = frames.schema.get_field_index(TOP)
+    pq.write_table(frames.set_column(column, TOP, paths), source / TABLE)
+    said = "pictures in files of their own are not read: "
+    assert "images/frame-0.png. Write" in refuses(said, "import", source, "--out", tmp_path / "data.h5", *LABEL)
 
 
 REFUSED = [
