@@ -32,6 +32,7 @@ from hypogoal.observations import (
     Shape,
     digest,
     fields_of,
+    is_stored,
     numbers_of,
     type_of,
     type_text,
@@ -232,9 +233,11 @@ def write_dataset(
 ) -> None:
     """Write collected states to ``path``. An earlier file there is replaced once the new file is complete.
 
-    Raises ``UserError`` if a name cannot be a file name, if labels are not truth values, or if numbers are not finite.
+    Raises ``UserError`` if a name cannot be a file name, if labels are not truth values, if numbers are not finite, or
+    if observations are of a type or shape that could not be read again.
     """
     require_names(collected.sub_goals)
+    _require_one_kind(collected)
     attributes = {
         "format": DATA_FORMAT,
         "domain": domain,
@@ -258,6 +261,19 @@ def write_dataset(
         if collected.features:  # a dataset, because they may exceed an attribute's size
             file["features"] = fixed(json.dumps(collected.features))
         file.attrs.modify("complete", True)
+
+
+def _require_one_kind(collected: Collected) -> None:
+    """Raise ``UserError`` if observations are of a type that files do not keep, or if sets differ in type or shape."""
+    dtype = collected.unlabelled.observations.dtype
+    shape = tuple(collected.observation_shape)
+    for name in ("labelled", "unlabelled", "heldout"):
+        given = getattr(collected, name).observations
+        is_alike = given.dtype == dtype and given.shape[1:] == shape
+        if not is_alike or not is_stored(dtype):
+            fault = f"the domain's {name} observations cannot be stored"
+            do = f"Give all sets as uint8, as float32 or as hypogoal.observations.packed makes them, of shape {shape}."
+            raise UserError(fault, f"{given.dtype} {given.shape}", do)
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]) -> None:
@@ -330,7 +346,7 @@ class Dataset:
         for key, (kind, shape) in fields_of(self.observation_shape, self.observation_dtype).items():
             size = prod(shape) if kind == NUMBERS else 1
             numbered = [f"{key or 'x'}[{place}]" for place in range(size)]
-            names += numbered if size > 1 else [key]
+            names += [key] if key and size == 1 else numbered
         return names
 
     def labelled(self, sub_goal: str) -> States:

@@ -94,6 +94,14 @@ def type_of(text: str) -> DType:
         raise ValueError(f"observations of type {text}") from None
 
 
+def is_stored(dtype: DType) -> bool:
+    """Return whether files can keep observations of this type, that is, whether :func:`type_of` gives it back."""
+    try:
+        return type_of(type_text(dtype)) == dtype
+    except ValueError:
+        return False
+
+
 def packed(parts: Mapping[str, Any], dtype: DType | None = None) -> Observations:
     """Return mixed observations (N,) made of arrays (N, ...) by key.
 

@@ -71,6 +71,37 @@ def test_what_is_not_written(tmp_path: Path, name: str, labels: list[Any], words
     assert not [*tmp_path.iterdir()]
 
 
+ZEROS = np.zeros((2, 3), np.float32)
+UNSORTED = np.zeros((2, 3), [("b", "<f4"), ("a", "|u1")])
+
+
+@pytest.mark.parametrize(
+    ("labelled", "others"),
+    [
+        (np.zeros((2, 3)), np.zeros((2, 3))),
+        (np.zeros((2, 3), ">f4"), np.zeros((2, 3), ">f4")),
+        (UNSORTED, UNSORTED),
+        (np.zeros((2, 3), np.uint8), ZEROS),
+        (np.zeros((2, 4), np.float32), ZEROS),
+    ],
+)
+def test_observations_that_could_not_be_read_are_not_written(tmp_path: Path, labelled: Any, others: Any) -> None:
+    """Spec G2: their types and shapes; the author of the domain learns what to give."""
+    labels = np.array([True, False])
+    sets = [States(observations, labels) for observations in (labelled, others, others)]
+    with pytest.raises(UserError, match="domain's labelled observations cannot be stored"):
+        write_dataset(tmp_path / "data.h5", Collected((3,), ("one",), *sets), domain="", config={}, seed=0)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("shape", [(1,), (), (1, 1)])
+def test_a_single_number_has_a_name(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    states = States(np.zeros((2, *shape), np.float32), np.array([True, False]))
+    collected = Collected(shape, ("one",), states, states, states)
+    write_dataset(tmp_path / "data.h5", collected, domain="", config={}, seed=0)
+    assert open_dataset(tmp_path / "data.h5").features() == ["x[0]"]
+
+
 def attribute(name: str, value: Any) -> Damage:
     def damage(file: h5py.File) -> None:
         file.attrs[name] = fixed(value) if isinstance(value, str) else value

@@ -18,7 +18,7 @@ from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
 from hypogoal.hypotheses import deep_lift, networks, patches
 from hypogoal.hypotheses.thresholds import log_odds_of
 from hypogoal.hypotheses.views import FullView, View, view_of
-from hypogoal.observations import NUMBERS, Observations, Shape, packed, type_of, type_text, values_in
+from hypogoal.observations import NUMBERS, Observations, Shape, numbers_of, packed, type_of, type_text, values_in
 
 THRESHOLD = 0.5  # the probability above which a prediction is positive, unless another threshold is set
 IMAGES_AT_ONCE = 64  # images in a plain forward pass that fit a CPU's cache; a GPU takes 16 times as many
@@ -117,20 +117,25 @@ class Ensemble(nn.Module):
             The N observations in the shape and type of the members' view.
 
         Raises:
-            UserError: if the observations have another shape or type than in training.
+            UserError: if the observations have another shape or type than in training, or numbers that are not finite.
         """
         dtype = self.view.dtype
         expected = f"{type_text(dtype)} (N, {', '.join(map(str, self.observation_shape))})"
         try:
-            if dtype.names and isinstance(observations, Mapping):
-                observations = packed(observations, dtype)
-            observations = np.asarray(observations)
-            if dtype == NUMBERS and observations.dtype == float:
-                observations = observations.astype(NUMBERS)
+            with np.errstate(over="ignore"):  # numbers that float32 cannot hold are refused below
+                if dtype.names and isinstance(observations, Mapping):
+                    observations = packed(observations, dtype)
+                observations = np.asarray(observations)
+                if dtype == NUMBERS and observations.dtype == float:
+                    observations = observations.astype(NUMBERS)
             if observations.dtype != dtype or observations.shape[1:] != self.observation_shape:
                 raise ValueError(f"{observations.dtype} {observations.shape}")
         except ValueError as error:  # also raised for other keys, and for states of different shapes
             raise UserError("these observations do not fit the ensemble", error, f"Give {expected}.") from None
+        are_finite = np.isfinite(numbers_of(observations)).all(axis=1)
+        if not are_finite.all():
+            fault = "observations have numbers that are not finite in float32"
+            raise UserError(fault, f"state {are_finite.argmin()}", "Clip or replace them.")
         return np.ascontiguousarray(self.view.see(observations))  # torch takes no flipped arrays
 
     def predictions(self, observations: Observations) -> Bools:
@@ -153,7 +158,7 @@ class Ensemble(nn.Module):
             float32 (N, K). Up to rounding, the probabilities of a state do not depend on the other states.
 
         Raises:
-            UserError: if the observations have another shape or type than in training.
+            UserError: if the observations have another shape or type than in training, or numbers that are not finite.
         """
         both = torch.from_numpy(self.logits(observations))
         return np.asarray(both.softmax(dim=-1)[..., 1])
@@ -202,7 +207,7 @@ class Ensemble(nn.Module):
             float32 (N, K, H, W, C) for pictures, else (N, K, *the shape of the view), in log-odds.
 
         Raises:
-            UserError: if the observations have another shape or type than in training.
+            UserError: if the observations have another shape or type than in training, or numbers that are not finite.
         """
         seen = self.see(observations)
         baseline = deep_lift.mean_state(self.see(against))

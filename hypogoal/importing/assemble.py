@@ -12,12 +12,13 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import GROUP, Collected, States, doubts_of, require_classes
-from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNLABELLED, Frames, together
+from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNJUDGED, UNLABELLED, Frames, together
 from hypogoal.observations import digest, packed
 
 ROW = "row"  # the origin that says a state's place in its set
 DOUBT = "{} times equal states have both labels of {}: no member can be right about {}"
 SPLIT = np.array([0.4, 0.4, 0.2])  # the shares of episodes that become labelled, unlabelled and held out
+NOBODY = "{} held-out states have no label: they are left out"
 MORE = "Give more, at least three episodes that are labelled; rows and pictures have their sets by name."
 REMARK = "no held-out states were given: {} of the labelled ones are held out, which says nothing about other contexts"
 
@@ -50,7 +51,11 @@ def assemble(
         raise UserError(f"{len(features)} names of features do not fit", f"{count} numbers", "Give one for each.")
     table["look"] = [digest(state).hex() for state in observations]
     table = with_roles(table, seed)
+    unjudged = table.index[table["role"] == UNJUDGED]
+    table = table.drop(unjudged)
     doubts = contradictions(table, labels, goals)
+    if len(unjudged):
+        doubts.append(NOBODY.format(len(unjudged)))
     table, remarks = apart(table, labels, share, seed)
     in_group = table["group"] != ""
     groups, _ = pd.factorize(table["group"].where(in_group, table["look"]))

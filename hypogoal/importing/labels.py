@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.own_code import load
 from hypogoal.data import Collected, joined, open_dataset, write_dataset
-from hypogoal.importing.states import UNLABELLED, Frames
+from hypogoal.importing.states import HELDOUT, UNJUDGED, UNLABELLED, Frames
 from hypogoal.observations import NUMBERS, digest
 
 LAST, TABLE = "last:", ".csv"  # the beginning of a rule for last frames, and the end of a rule that names a table
@@ -28,12 +29,14 @@ def labels_of(frames: Frames, rules: Mapping[str, str]) -> Bools:
     ``rules`` are, by sub-goal, one of four texts. The name of a column means the frames in which the column is above 0.
     ``last:N`` means the last N frames of each success. ``FILE.csv`` is a table of positive frames. ``module:function``
     is asked about each observation, which is a dictionary if there are several keys. Frames of which a rule knows
-    nothing, such as those of episodes that a table does not list, become unlabelled.
+    nothing, such as those of episodes that a table does not list, become unlabelled, or unjudged if they are held out.
     """
     marks = [_marks(frames, rule) for rule in rules.values()]
     labels = np.stack(marks, axis=1)
     is_unknown = np.isnan(labels).any(axis=1)
-    frames.table.loc[is_unknown, "role"] = UNLABELLED
+    is_held = frames.table["role"] == HELDOUT
+    frames.table.loc[is_unknown & ~is_held, "role"] = UNLABELLED
+    frames.table.loc[is_unknown & is_held, "role"] = UNJUDGED
     return labels > 0
 
 
@@ -106,22 +109,28 @@ def add_labels(source: Path, file: Path, sub_goal: str, path: Path, seed: int) -
     """Write the states of the data file ``source`` to ``file``, with labels for the states in the table at ``path``.
 
     ``audit`` proposes the table beside pictures of the states, and a person or a script fills it in. Returns a line on
-    how many states are labelled. Raises ``UserError`` if the table is of other data or names a state twice, or if the
-    data have several sub-goals.
+    how many states are labelled. States that equal a state in the table get that state's label, too. Raises
+    ``UserError`` if the table is of other data or names a state twice, or if the data have several sub-goals.
     """
     dataset = open_dataset(source)
     if dataset.sub_goals != (sub_goal,):
         goals = ", ".join(dataset.sub_goals)
         raise UserError("a table labels data of one sub-goal, its own", sub_goal, f"It has {goals}.")
     unlabelled = dataset.unlabelled_states()
-    places = {digest(state).hex(): place for place, state in enumerate(unlabelled.observations)}
+    places: dict[str, list[int]] = {}
+    for place, state in enumerate(unlabelled.observations):
+        look = digest(state).hex()
+        alike = places.setdefault(look, [])
+        alike.append(place)
     table = read_table(path, {"label": str, "digest": str})
     filled = table[table["label"] != ""]
     with reading(path, "Give states of these data, each once, with 1 or 0; or audit an ensemble of these data again."):
-        numbers = [places.pop(look) for look in filled["digest"]]
+        copies = [places.pop(look) for look in filled["digest"]]
         labels = [TRUTHS[label] for label in filled["label"]]
-    rows = np.array(numbers, int)
-    marked = replace(unlabelled.where(rows), labels=np.array(labels, bool))
+    rows = np.array([*chain(*copies)], int)
+    counts = np.array([*map(len, copies)], int)
+    of_each = np.repeat(np.array(labels, bool), counts)
+    marked = replace(unlabelled.where(rows), labels=of_each)
     every = np.arange(len(unlabelled.labels))
     others = np.delete(every, rows)
     features: Sequence[str] = ()

@@ -31,6 +31,7 @@ HDF5 = (".h5", ".hdf5")
 DEMOS = "Give a file with data/demo_0/obs, as robomimic's dataset_states_to_obs.py writes it; arrays as .npz."
 KEYS = "Choose those that have one by --key; () is a single value, None a broken link."
 MASK = "Give names of data/*, or take the mask out: del file['mask/valid']."
+EMBED = "Write their bytes into the table, as LeRobot's embed_images does."
 TABLE = ".csv"  # a table of labels may lie beside films
 # For each set of states, the name of its observations, and the prefix of the names of its other arrays.
 SETS = {
@@ -268,9 +269,15 @@ def _table(file: Path) -> pd.DataFrame:
 
 
 def _cells(file: Path, column: Any, rows: Ints) -> Iterator[Array]:
-    """Return the pictures in some cells of a column. A cell is ``{bytes, path}``."""
+    """Return the pictures in some cells of a column. A cell is ``{bytes, path}``.
+
+    Raises ``UserError`` if a cell has no bytes, but the path of a picture in a file of its own.
+    """
     for cell in column.iloc[rows]:
-        yield picture_of(cell["bytes"], file)
+        data = cell["bytes"]
+        if data is None:
+            raise UserError("pictures in files of their own are not read", f"{file}: {cell['path']}", EMBED)
+        yield picture_of(data, file)
 
 
 def _episode(

@@ -21,6 +21,7 @@ from hypogoal.domains.observations import CLEARLY, reading_of, shrunk_picture
 from hypogoal.observations import NUMBERS, PICTURE, spread_rows
 
 ROLES = LABELLED, UNLABELLED, HELDOUT = "labelled", "unlabelled", "heldout"
+UNJUDGED = "unjudged"  # of a frame that is held out, of which nobody says whether the sub-goal holds
 STACKED = "Give pictures as uint8 (H, W, C); 'import --stack' puts stacked frames among the channels."
 MOST_COMPARED = 2_000  # the most rows of numbers that are compared before and after the cast to float32
 LEFT = 0.9  # the share of a column's distinct values that float32 must keep
@@ -88,7 +89,7 @@ class Frames(NamedTuple):
 
     Attributes:
         table: a row for each frame, kept or not, with its ``name`` in messages, its ``episode``, ``group`` and
-            ``role``, and whether the frame is ``kept``.
+            ``role`` or ``UNJUDGED``, and whether the frame is ``kept``.
         columns: the episodes' columns, a row for each frame.
         seen: by key, a picture or numbers for each frame that is kept. If there is one key, it is "".
         channels: frames and colours of stacked pictures by key, see :class:`hypogoal.data.Collected`.

@@ -13,7 +13,9 @@ from hypogoal.core.progress import say
 
 SOURCE = "Arrays, pictures, or episodes (Minari, LeRobot, robomimic, films)."
 NAME = "The sub-goal's name; one per column of the labels, in order."
-LABEL = "Episodes: a column, last:N frames, FILE.csv, module:function; data file: FILE.csv."
+RULES = "Episodes: a column, last:N frames, FILE.csv, module:function; data file: FILE.csv."
+SHAPED = "If rewards are above 0 before success, too, name a column of success or give FILE.csv in place of last:N."
+LABEL = f"{RULES} {SHAPED}"
 SIDE = "Most pixels on the longer side of pictures; 0: as many as given."
 GROUP = "Arrays: which one says what states belong together; held out whole."
 NAMING = "Recordings are labelled by --label NAME=RULE, arrays and pictures have --sub-goal NAME."

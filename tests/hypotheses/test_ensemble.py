@@ -15,6 +15,8 @@ from hypogoal.core.seeding import torch_generator
 from hypogoal.hypotheses.ensemble import PATCHES_FROM, Ensemble, read_ensemble
 from hypogoal.hypotheses.networks import NETWORKS, as_input
 from hypogoal.hypotheses.stacked import StackedMembers
+from hypogoal.hypotheses.views import FullView
+from hypogoal.observations import NUMBERS, packed
 
 SHAPE = (48, 48, 3)
 
@@ -89,6 +91,21 @@ def test_foreign_observations_are_one_clear_line() -> None:
         ensemble_of(1).predict(np.zeros((2, *SHAPE)))  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"uint8 \(48, 48, 3\)"):
         ensemble_of(1).predict(np.zeros(SHAPE, dtype=np.uint8))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("number", [1e300, -np.inf, np.nan])
+def test_numbers_that_are_not_finite_are_one_clear_line(number: float) -> None:
+    """Spec G2: in float32, alone or beside pictures."""
+    said = "numbers that are not finite in float32: state 1"
+    numbers = np.array([[0.0, 1.0], [number, 1.0]])
+    parts = {"at": numbers, "eye": np.zeros((2, *SHAPE), np.uint8)}
+    mixed = packed({**parts, "at": np.zeros((2, 2))}).dtype
+    generator = torch_generator(1, "weights")
+    for observations, shape, dtype in ((numbers, (2,), NUMBERS), (parts, (), mixed)):
+        ensemble = Ensemble("auto", shape, 1, generator, FullView(shape, dtype))
+        with pytest.raises(UserError, match=said):
+            ensemble.predict(observations)
 
 
 def test_verdicts_are_above_each_members_threshold() -> None:

@@ -252,3 +252,19 @@ def test_a_table_saved_by_a_spreadsheet_is_read(data: Path, tmp_path: Path) -> N
     np.testing.assert_array_equal(states.observations[-4:], before.unlabelled()[:4])
     assert states.labels[-4:].tolist() == [False, True, False, True]
     refuses("labels data of one sub-goal", "import", data, "--label", f"shut={marks}", "--out", tmp_path / "x.h5")
+
+
+def test_equal_states_get_one_label(tmp_path: Path) -> None:
+    others, _ = pictures(3, seed=1)
+    places = [0, 1, 1, 2, 1]
+    np.savez(tmp_path / "own.npz", **arrays(unlabelled=others[places]))
+    run("import", tmp_path / "own.npz", "--out", tmp_path / "data.h5", "--sub-goal", "on", "-q")
+    marks = tmp_path / "table.csv"
+    marks.write_text(f"digest,label\n{digest(others[1]).hex()},1\n{digest(others[0]).hex()},0\n")
+    said = run("import", tmp_path / "data.h5", "--label", f"on={marks}", "--out", tmp_path / "more.h5", "-q").err
+    assert "4 states are labelled now, 1 are not" in said
+    after = open_dataset(tmp_path / "more.h5")
+    np.testing.assert_array_equal(after.unlabelled(), others[2:])
+    states = after.labelled("on")
+    np.testing.assert_array_equal(states.observations[-4:], others[[1, 1, 1, 0]])
+    assert states.labels[-4:].tolist() == [True, True, True, False]

@@ -10,6 +10,8 @@ from typing import Any, TypeAlias
 import h5py
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from command_line import refuses, run
 
@@ -255,6 +257,20 @@ def test_padded_names_are_held_out_and_unknown_success_is_unlabelled(tmp_path: P
         assert label is None or state[0] != 1
 
 
+def test_held_out_demonstrations_without_labels_are_left_out(tmp_path: Path) -> None:
+    """They are not trained on, and the others are divided as if they were not there."""
+    source = small_robomimic(tmp_path / "x.hdf5", put("mask/valid", [b"demo_0", b"demo_5"]))
+    table = tmp_path / "labels.csv"
+    spans = [f"demo_{demo},3,5" for demo in range(5)]
+    table.write_text("\n".join(["episode,from,to", *spans]))
+    said = run("import", source, "--out", tmp_path / "data.h5", "--label", f"on={table}", "-q").err
+    assert "hypogoal: 5 held-out states have no label: they are left out\n" in said
+    data = open_dataset(tmp_path / "data.h5")
+    assert {state[0] for state in data.heldout("on").observations} == {0}
+    assert len(data.labelled("on").labels) == len(data.unlabelled()) == 10
+    assert {state[0] for state, _ in frames_of(data, "on")} == {0, 1, 2, 3, 4}
+
+
 def test_minari_is_read(tmp_path: Path) -> None:
     """Spec B6: whole episodes are labelled, unlabelled or held out, the same for the same seed."""
     folder, data = save_minari(tmp_path / "own-v0"), tmp_path / "data.h5"
@@ -364,6 +380,19 @@ def test_a_damaged_dataset_is_one_line(datasets: Path, tmp_path: Path, damage: C
     damage(source)
     keys = ["--key", TOP, "--key", WRIST, "--key", STATE]
     refuses(words, "import", source, "--out", tmp_path / "data.h5", *LABEL, *keys)
+
+
+def test_pictures_in_files_of_their_own_are_one_line(datasets: Path, tmp_path: Path) -> None:
+    """Spec G2: a table that has paths in place of bytes."""
+    source = tmp_path / "source"
+    shutil.copytree(datasets / "v3.0-image", source)
+    frames = pq.read_table(source / TABLE)
+    kind = frames.schema.field(TOP).type
+    paths = pa.array([{"bytes": None, "path": "images/frame-0.png"}] * len(frames), kind)
+    column = frames.schema.get_field_index(TOP)
+    pq.write_table(frames.set_column(column, TOP, paths), source / TABLE)
+    said = "pictures in files of their own are not read: "
+    assert "images/frame-0.png. Write" in refuses(said, "import", source, "--out", tmp_path / "data.h5", *LABEL)
 
 
 REFUSED = [
