@@ -379,7 +379,7 @@ class Domain(ABC, Generic[C]):
     def distance_to(self, sub_goal: str, positions: Ints) -> Ints:
         """Return the distance from positions to the nearest place where a sub-goal holds, int (n,).
 
-        The domain must have ``measures``.
+        The domain must have ``measures``, and ``sub_goal`` is one of its ``sub_goals``.
         """
         raise NotImplementedError
 
