@@ -55,6 +55,14 @@ def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
     assert artefact.faults() == [] and find_artefacts(tmp_path, "meta")[0].path == out
 
 
+def test_artefacts_are_found_at_any_depth(tmp_path: Path) -> None:
+    """Cells may have names of any depth; drafts are hidden."""
+    deep = tmp_path / "meta" / "dbat" / "size-3" / "seed-0"
+    for out in (deep, tmp_path / "meta" / "dbat" / ".draft"):
+        finish(out)
+    assert [artefact.path for artefact in find_artefacts(tmp_path, "meta")] == [deep]
+
+
 def test_white_space_and_took_are_no_change(tmp_path: Path) -> None:
     """An editor and git's line ends may change a manifest; another seed in it is another input."""
     source, out = tmp_path / "ensemble", tmp_path / "meta"
