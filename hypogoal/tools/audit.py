@@ -19,7 +19,10 @@ REPORT = "audit.json"
 WHERE = "Where to play; without it, look at recorded data."
 WHICH = "The labelled data to look at. Default: what the members were trained with."
 TRUTH = "The sub-goal that the classifier is meant to recognise."
-LIMIT = "Exit with code 3 if false positives are more than this share of executions, or of states met or recorded."
+LIMIT = (
+    "Exit with code 3 if false positives are more than this share: in play, of executions or of states met;"
+    " on recorded data, of states labelled as failures, where the worst member counts."
+)
 FAILED = 3
 
 

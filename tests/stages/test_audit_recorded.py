@@ -77,6 +77,13 @@ def test_a_function_is_audited_on_labels_by_hand(mixed_run: Path, tmp_path: Path
         }  # fmt: skip
 
 
+def test_the_help_says_of_what_the_share_is() -> None:
+    """In play of executions and of states met; on recorded data of known failures, as :func:`audited` counts them."""
+    text = " ".join(run("audit", "--help").out.replace("│", " ").split())
+    assert "in play, of executions or of states met" in text
+    assert "on recorded data, of states labelled as failures" in text
+
+
 def test_what_nobody_could_measure_is_no_share(tmp_path: Path, capsys: Any) -> None:
     """Without a known failure there is no share: exit code 3, and the line says why."""
     data = tmp_path / "data.h5"
