@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 from command_line import fails, refuses, run
 from toy import DATA, PLAY, SMALL, write_toy
@@ -189,6 +190,13 @@ command = "train-ensemble {{data}} {SMALL} --set sub_goals=nowhere"
 name = "lost"
 command = "train-meta {{worse}} {PLAY}"
 """
+
+
+def test_no_two_rows_of_results_differ_in_the_value_alone(whole: Path) -> None:
+    """An agent and uniform-random choice among its own options are two methods, so no mean mixes them."""
+    rows = pd.read_csv(whole / "out" / "evaluation" / "results.csv")
+    assert rows.loc[rows["stage"] == "train-meta", "measured_method"].nunique() > 1
+    assert not rows.drop(columns="value").duplicated().any()
 
 
 def test_a_cell_begun_otherwise_is_told_as_a_part_of_its_run(whole: Path, out: Path) -> None:
