@@ -17,7 +17,17 @@ NAME = r"^\w[\w.,:=+-]*(/\w[\w.,:=+-]*)*$"  # names of cells, which are places i
 HERE = "{run}"  # stands for the run's folder in a cell's words
 DONE, RUNNING, FAILED, WAITING = "done", "running", "failed", "waiting"
 STOPPED = ("", "130", "143", "-2", "-15")  # exit codes that are no failure: none yet, Ctrl-C, SIGTERM, or their signals
-COLUMNS = ["cell", "sub_goal", "member", "scope", "quantity", "value"]
+# Columns of ``numbers.csv`` that ``results.csv`` has, by the names they have there: cells have a method of their own.
+COLUMNS = {
+    "artefact": "cell",
+    "method": "measured_method",
+    "layout": "measured_layout",
+    "sub_goal": "sub_goal",
+    "member": "member",
+    "scope": "scope",
+    "quantity": "quantity",
+    "value": "value",
+}
 
 Value = str | int | float
 
@@ -141,7 +151,7 @@ def write_results(run: Path, evaluation: Path) -> None:
     rows = [{"cell": cell.name, "stage": cell.stage, **cell.columns} for cell in cells]
     outputs = pandas.DataFrame(rows, dtype=object)
     numbers = pandas.read_csv(evaluation / "numbers.csv", dtype=str, keep_default_na=False)
-    of_ends = numbers.query("step == ''").rename(columns={"artefact": "cell"})[COLUMNS]
+    of_ends = numbers.query("step == ''")[[*COLUMNS]].rename(columns=COLUMNS)
     results = outputs.merge(of_ends, on="cell", suffixes=("_of_cell", ""))
     results.to_csv(evaluation / "results.csv", index=False, lineterminator="\n")
 

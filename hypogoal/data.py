@@ -9,10 +9,8 @@ so a file in which it is false was cut off.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from math import prod
@@ -24,7 +22,8 @@ import numpy as np
 from hypogoal.core.arrays import Array, Bools, Ints
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.files import NO_FILE_NAME, plain_names, reading, replacing
+from hypogoal.core.hdf5 import RECOLLECT, create_hdf5, fixed, opened, plain, store, whole
+from hypogoal.label_checks import require_names
 from hypogoal.observations import (
     NUMBERS,
     DType,
@@ -40,14 +39,8 @@ from hypogoal.observations import (
 
 DATA_FORMAT = 2  # in format 1 texts had variable length
 SPLITS = ("labelled", "heldout")
-RECOLLECT = "Collect it again."
-ANEW = "Bring all files that it is made of, or write it again, whole."
-GET_MORE = "Collect more steps or other layouts, or bring a policy that gets there."
 GROUP = "group"  # an origin; to choose a weight, the states of a group are held out together
 PLANTED = "planted_"  # the beginning of the names of origins that say whether a state has a feature
-FEW = 10  # with fewer labelled states of a class, a warning is given
-RARE = 0.05  # with a smaller share of a class among the labelled states, a warning is given
-COLUMN_CHUNK = 1 << 16  # values of labels or of an origin in a chunk
 
 
 @dataclass(frozen=True)
@@ -93,10 +86,6 @@ class Collected:
     channels: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
 
-class Unmet(UserError):
-    """An error because play did not reach the states needed."""
-
-
 def leave_out(states: States, *training: Observations) -> States:
     """Return the states whose observations are in none of the sets ``training``, of observations (M, ...) each."""
     digests = set(map(digest, chain(*training)))
@@ -115,112 +104,6 @@ def joined(parts: Sequence[States]) -> States:
     for name in sorted(shared):
         origins[name] = np.concatenate([part.origins[name] for part in parts])
     return States(observations, labels, origins)
-
-
-def doubts_of(labelled: Bools, heldout: Bools, goals: Sequence[str]) -> list[str]:
-    """Return a line for each doubt whether the labels suffice.
-
-    A sub-goal is in doubt if a class has few labelled states, or if the held-out states are of one class only.
-    ``labelled`` (N, G) and ``heldout`` (M, G) are labels.
-    """
-    lines = []
-    for goal, column, judged in zip(goals, labelled.T, heldout.T, strict=True):
-        positives, count = int(column.sum()), len(column)
-        if min(positives, count - positives) < max(FEW, RARE * count):
-            lines.append(f"{goal} has {positives} positives among {count} labelled states: classes are unbalanced")
-        if len(np.unique(judged)) < 2:
-            lines.append(f"{goal} has one class only in the held-out states, so it cannot be judged by them")
-    return lines
-
-
-def require_classes(labels: Bools, goals: Sequence[str], where: object, do: str) -> None:
-    """Raise ``Unmet`` if the labels (N, G) of labelled states are of one class only for a sub-goal.
-
-    ``where`` and ``do`` are parts of the error.
-    """
-    for goal, column in zip(goals, labels.T, strict=True):
-        if len(np.unique(column)) < 2:
-            lacking = "negatives" if column.any() else "positives"
-            raise Unmet(f"{goal} has no {lacking} among {len(labels)} labelled states", where, do)
-
-
-def require_names(sub_goals: Sequence[str]) -> None:
-    """Raise ``UserError`` if there are no names, if a name is not plain, or if two names differ only in case."""
-    if not plain_names(sub_goals):
-        do = f"Give one or more, different even if case is ignored, without separators and {' '.join(NO_FILE_NAME)}"
-        raise UserError("sub-goals need different names that are usable as file names", ", ".join(sub_goals), f"{do}.")
-
-
-@contextlib.contextmanager
-def opened(path: Path, do: str = RECOLLECT, subject: str = "the data file") -> Iterator[Any]:
-    """Open an HDF5 file for reading. Raises ``UserError`` if anything cannot be read within the context."""
-    import h5py
-
-    with reading(path, do, subject), h5py.File(path, "r", locking="best-effort") as file:
-        yield file
-
-
-@contextlib.contextmanager
-def create_hdf5(path: Path) -> Iterator[Any]:
-    """Give a new HDF5 file, which is built in memory and written when the context ends.
-
-    On a full disk the HDF5 library crashes the process (a segmentation fault, h5py 3.16), but writing the finished
-    bytes ourselves raises a normal ``OSError``.
-    """
-    import h5py
-
-    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
-        yield file
-        file.flush()
-        image = file.id.get_file_image()
-    with replacing(path) as fresh:
-        fresh.write_bytes(image)
-
-
-def whole(data: Any) -> Any:
-    """Return the HDF5 dataset ``data``. Raises ``UserError`` if some of its values are not stored.
-
-    HDF5 reads other values in place of those that are not stored. Values are not stored where chunks or arrays were
-    never written, or where raw files or parts of a virtual dataset are gone.
-    """
-    is_whole = data.id.get_storage_size() > 0 or not data.size
-    if data.chunks:
-        counts = np.ceil(np.divide(data.shape, data.chunks))
-        is_whole = data.id.get_num_chunks() == counts.prod()
-    for name, offset, size in data.external or ():
-        is_whole &= Path(name).stat().st_size >= offset + min(size, data.nbytes)
-    if data.is_virtual:
-        is_whole = _is_covered(data)
-    if not is_whole:
-        raise UserError(f"{data.name} lacks values, for which HDF5 would give others", data.file.filename, ANEW)
-    return data
-
-
-def _is_covered(data: Any) -> bool:
-    """Return whether the parts of a virtual dataset leave no gap in it. Raises ``UserError`` if a part lacks values."""
-    import h5py
-
-    whole_file = Path(data.file.filename)
-    with h5py.File(io.BytesIO(), "w") as scratch:
-        covered = scratch.create_dataset("covered", data.shape, bool)
-        for target, file, name, source in data.virtual_sources():
-            path = whole_file if file == "." else whole_file.parent / file
-            with opened(path, ANEW, "a part of the recording") as part:
-                ones = np.ones(whole(part[name]).shape, bool)
-                source.set_extent_simple(ones.shape)
-                covered.id.write(source, target, ones)
-        return bool(np.all(covered))
-
-
-def fixed(text: str) -> Array:
-    """Return a text as a UTF-8 string of fixed length.
-
-    HDF5 stores a string of fixed length in place, but a string of variable length in its global heap.
-    """
-    import h5py
-
-    data = text.encode()
-    return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
 
 
 def write_dataset(
@@ -289,7 +172,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
         for name in ("observations", "origin"):  # in this order, whatever the hashes of this process
             if name in first and name not in group:
                 group[name] = first[name]
-        _store(group, "labels", column)
+        store(group, "labels", column)
 
 
 def _write_states(group: Any, states: States) -> None:
@@ -297,22 +180,9 @@ def _write_states(group: Any, states: States) -> None:
     if not finite.all():
         fault = "the domain's observations have numbers that are not finite"
         raise UserError(fault, f"{group.name}, state {finite.argmin()}", "Clip or replace them.")
-    _store(group, "observations", states.observations)
+    store(group, "observations", states.observations)
     for name, values in states.origins.items():
-        _store(group, f"origin/{name}", values)
-
-
-def _store(group: Any, name: str, values: Array) -> None:
-    """Write observations compressed, and other values with checksums, because a flipped label would still be valid."""
-    filters = {}
-    count = len(values)
-    if count and name == "observations":
-        chunk = (min(64, count), *values.shape[1:])
-        filters = {"chunks": chunk, "compression": "gzip", "compression_opts": 1}
-    elif count:
-        chunk = (min(COLUMN_CHUNK, count),)
-        filters = {"chunks": chunk, "fletcher32": True}
-    group.create_dataset(name, data=values, **filters)
+        store(group, f"origin/{name}", values)
 
 
 @dataclass(frozen=True)
@@ -413,12 +283,6 @@ class Dataset:
             return States(values, labels, origins)
 
 
-def _plain(attribute: Any) -> Any:
-    """Return an attribute as a Python str, int, float or bool."""
-    value = np.asarray(attribute).item()
-    return value.decode() if isinstance(value, bytes) else value
-
-
 def _column(group: Any, name: str) -> Array:
     """Return the values of a dataset that has one value for each state of a group, (N,)."""
     values, states = whole(group[name])[()], len(group["observations"])
@@ -430,7 +294,7 @@ def _column(group: Any, name: str) -> Array:
 def open_dataset(path: Path) -> Dataset:
     """Open a data file that ``collect`` wrote, or the user in the same schema. Raises ``UserError`` for other files."""
     with opened(path) as file:
-        attributes = {name: _plain(value) for name, value in file.attrs.items()}
+        attributes = {name: plain(value) for name, value in file.attrs.items()}
         version = attributes.get("format")
         if not isinstance(version, int):
             raise UserError("not a hypogoal data file", path, "'hypogoal collect' and 'hypogoal import' make one.")

@@ -15,7 +15,8 @@ from command_line import fails, refuses, run
 from toy_data import SHAPE, write
 
 from hypogoal.core.errors import UserError
-from hypogoal.data import Collected, States, fixed, open_dataset, opened, write_dataset
+from hypogoal.core.hdf5 import fixed, opened
+from hypogoal.data import Collected, States, open_dataset, write_dataset
 
 OBSERVATIONS, LABELS = "labelled/one/observations", "labelled/one/labels"
 CRASH = """

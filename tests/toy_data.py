@@ -11,8 +11,9 @@ import torch
 
 from hypogoal.core.artefacts import LOG, MANIFEST
 from hypogoal.core.drafts import create
+from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.core.tensors import save_tensors
-from hypogoal.data import Collected, States, create_hdf5, write_dataset
+from hypogoal.data import Collected, States, write_dataset
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 
 SHAPE = (4, 5, 3)

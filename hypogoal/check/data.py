@@ -9,11 +9,12 @@ from time import perf_counter
 
 from hypogoal.check.verdict import Verdict, verdicts
 from hypogoal.core.processes import allowed, prepare
-from hypogoal.data import Dataset, doubts_of, open_dataset
+from hypogoal.data import Dataset, open_dataset
 from hypogoal.hypotheses.auto import AutoTraining, training_of
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.scores import idle_members, mean_disagreement
 from hypogoal.hypotheses.sub_goals import checked
+from hypogoal.label_checks import doubts_of
 
 SECONDS = 45.0  # how long all sub-goals together are trained
 TIMED = 10  # steps that are timed

@@ -20,6 +20,7 @@ from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Domain, Engine
 from hypogoal.domains.gymnasium.play import PASS_SEEDS
 from hypogoal.hypotheses.networks import AUTO
+from hypogoal.label_checks import GET_MORE, Unmet, require_classes
 from hypogoal.observations import PICTURE, numbers_of
 from hypogoal.options.networks import embedding_for
 
@@ -127,7 +128,7 @@ class _Played:
             for _ in range(2):
                 try:
                     states = collected(domain, self.config, self.seed)
-                except data.Unmet as error:
+                except Unmet as error:
                     warnings.warn(str(error), stacklevel=1)
                     return "not looked at: play did not reach the states"
                 data.write_dataset(place, states, domain=domain.name, config={}, seed=self.seed)
@@ -143,7 +144,7 @@ class _Played:
             count = max(len(observations), 1)
             self.require_observations(name, observations, count)
         labels = states.labelled.labels
-        data.require_classes(labels, goals, "collect", data.GET_MORE)
+        require_classes(labels, goals, "collect", GET_MORE)
         return f"{len(labels)} labelled states, positives of each sub-goal: {labels.sum(0)}"
 
     def require_observations(self, name: str, observations: Any, count: int) -> None:

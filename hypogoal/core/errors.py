@@ -22,6 +22,10 @@ class UserError(Exception):
         super().__init__(printable(line))
 
 
+class NotInstalled(UserError):
+    """A name that nothing built in and no installed package has."""
+
+
 class Complete(Exception):
     """A signal that the output to resume is complete and as requested, which is no error.
 

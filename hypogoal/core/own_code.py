@@ -19,7 +19,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, TypeVar
 
-from hypogoal.core.errors import NumericalError, UserError
+from hypogoal.core.errors import NotInstalled, NumericalError, UserError
 
 TRUST = "--trust"
 VARIABLE = "HYPOGOAL_TRUST"
@@ -96,7 +96,7 @@ def load(name: str, role: str, group: str, built_in: Mapping[str, str]) -> Any:
         if ":" not in name:
             choices = ", ".join(sorted(places))
             do = f"Choose one of {choices}, or give module:object." if places else "Give module:object."
-            raise UserError(f"unknown {role}", name, do)
+            raise NotInstalled(f"unknown {role}", name, do)
         require_trust(name, role)
         if os.getcwd() not in sys.path:
             sys.path.append(os.getcwd())

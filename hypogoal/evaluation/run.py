@@ -15,13 +15,12 @@ from pandas import DataFrame
 from hypogoal.core.artefacts import MANIFEST, Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading, visible
+from hypogoal.core.hdf5 import opened
 from hypogoal.core.own_code import command
-from hypogoal.data import opened
 from hypogoal.evaluation.table import EVALUATE_AGAIN, read_numbers
 from hypogoal.options.tables import Executions
 
 FORMAT = 6  # the format of an evaluation, which its ``run.json`` names
-DEPTH = 3  # levels of folders below a run that are searched for artefacts
 
 
 @dataclass(frozen=True)
@@ -74,12 +73,11 @@ class Contents:
 
 
 def find_artefacts(run: Path, kind: str) -> list[Artefact]:
-    """Return all artefacts of a kind in ``run``, or at most ``DEPTH`` levels below, sorted by path."""
+    """Return all artefacts of a kind in ``run`` or anywhere below, sorted by path."""
     if not run.is_dir():
         raise UserError("no such run", run, "Give the folder of a run.")
-    folders = [path.parent for path in visible(run, MANIFEST)]
-    near = [folder for folder in folders if len(folder.relative_to(run).parts) <= DEPTH]
-    return [artefact for artefact in map(Artefact, near) if artefact.kind == kind]
+    artefacts = [Artefact(path.parent) for path in visible(run, MANIFEST)]
+    return [artefact for artefact in artefacts if artefact.kind == kind]
 
 
 def find(run: Path) -> Contents:

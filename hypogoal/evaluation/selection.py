@@ -1,5 +1,6 @@
 """Figures 7 and 8: which members the meta-policy prefers, and where their options stop."""
 
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -145,12 +146,19 @@ def context(results):
     table = wide.reindex(columns=[*place, *NUMBERS])
     learned = table["method"].isin([*chosen_by(results, "learned")])
     shown = table[learned] if learned.any() else table
-    members = shown[shown["artefact"] == shown["artefact"].min()].reset_index(drop=True)
+    first = min(shown["artefact"], key=_by_numbers)
+    members = shown[shown["artefact"] == first].reset_index(drop=True)
     return {
         "table": table,
         "members": members,
         "figures": [*_figures(members, results.arrays)],
     }
+
+
+def _by_numbers(path):
+    """Return a key that sorts paths by the numbers in them, so that seed-2 comes before seed-10."""
+    texts = re.split(r"(\d+)", path)
+    return [int(text) if text.isdecimal() else text for text in texts]
 
 
 def _figures(members, arrays):

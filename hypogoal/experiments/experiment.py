@@ -182,6 +182,14 @@ class File(RunConfig):
                 yield Command(row.at(point), command, {"group": row.name, **point})
 
 
+def _kind_of(axis: Sequence[Value]) -> Any:
+    """Return the type of an axis's values. Integers beside other numbers are such numbers, too."""
+    if isinstance(axis, str):  # integers, such as 0-9
+        return int
+    kinds = {type(value) for value in axis}
+    return float if kinds == {int, float} else type(axis[0])
+
+
 def read_toml(path: Path) -> Experiment:
     """Return the experiment in a TOML file. Raises ``UserError`` if there is none."""
     readable = partial(reading, path, "Mend the file, see docs/formats.md.", "the experiment")
@@ -190,7 +198,7 @@ def read_toml(path: Path) -> Experiment:
         file = File.model_validate(tomllib.loads(text))
         fields = {}
         for name, axis in file.axes.items():
-            kind: Any = int if isinstance(axis, str) else type(axis[0])
+            kind: Any = _kind_of(axis)
             fields[name] = (tuple[kind, ...], ())
         model = run_config(fields)
 

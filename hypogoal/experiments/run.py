@@ -132,10 +132,11 @@ def discard(cells: Sequence[Cell]) -> None:
 def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None], forked: bool | None = None) -> None:
     """Run cells that are not done, in their order, until each is done, has failed, or needs a cell that has failed.
 
-    At most ``workers`` cells (0: one per core) run at once, and cells that start together share the cores. If another
-    process, left over by a run that was killed, is making a cell, that cell is waited for. A cell that crashes goes on
-    from its checkpoint, at most ``CRASHES`` times. If the run is stopped, cells that still run get SIGTERM. ``forked``:
-    cells start from one process that has imported what they need; this is the default on Linux without CUDA.
+    At most ``workers`` cells (0: one per core) run at once. Cells that start together share the cores, less one for
+    each cell that already runs. If another process, left over by a run that was killed, is making a cell, that cell is
+    waited for. A cell that crashes goes on from its checkpoint, at most ``CRASHES`` times. If the run is stopped, cells
+    that still run get SIGTERM. ``forked``: cells start from one process that has imported what they need; this is the
+    default on Linux without CUDA.
     """
     if forked is None:
         forked = sys.platform == "linux" and not any("cuda" in cell.words for cell in cells)
@@ -160,11 +161,13 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                 makeable = [cell for cell in todo if cell.is_makeable and not cell.draft.is_locked]
                 at_work = {cell.place for cell in [*makeable, *running.values()]}
                 ready = [cell for cell in makeable if at_work.isdisjoint(cell.after)]
-                for cell in ready[:free]:
+                starting = ready[:free]
+                idle_cores = cores() - len(running)
+                for cell in starting:
                     todo.remove(cell)
                     say(f"{cell.name} begins; {_to_come(cells, len(todo), time.monotonic() - begun_at)}")
                     # A fork has the environment of the process that it is forked from.
-                    variables = {**os.environ, CORES: str(max(1, free // len(ready)))}
+                    variables = {**os.environ, CORES: str(max(1, idle_cores // len(starting)))}
                     words = [*cell.command, "--resume"]
                     process = context.Process(target=_make, args=(words, cell.log(), variables))
                     process.start()

@@ -11,12 +11,12 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from hypogoal.core.arrays import Bools, Ints, tensor
 from hypogoal.core.checkpoints import Resumable
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import require_classes
 from hypogoal.hypotheses import patches
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.hypotheses.networks import at_once, inputs_of
 from hypogoal.hypotheses.views import Origins, changed_by, pools_of
+from hypogoal.label_checks import require_classes
 from hypogoal.observations import Observations, values_in
 
 Numbers = Ints  # (B,), the indices of states

@@ -11,8 +11,9 @@ from hypogoal.core.arrays import Bools
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import GROUP, Collected, States, doubts_of, require_classes
+from hypogoal.data import GROUP, Collected, States
 from hypogoal.importing.states import HELDOUT, LABELLED, ROLES, UNJUDGED, UNLABELLED, Frames, together
+from hypogoal.label_checks import doubts_of, require_classes
 from hypogoal.observations import digest, packed
 
 ROW = "row"  # the origin that says a state's place in its set

@@ -20,7 +20,7 @@ import pandas as pd
 from hypogoal.core.arrays import Array, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import AGAIN, reading
-from hypogoal.data import opened, whole
+from hypogoal.core.hdf5 import opened, whole
 from hypogoal.importing.pictures import FILMS, count_frames, frames_in, picture_of
 from hypogoal.importing.states import HELDOUT, LABELLED, NAMED, UNLABELLED, Episode, files_of
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hypogoal.core.arrays import Bools, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
-from hypogoal.data import create_hdf5
+from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.domains.base import Engine, Step
 from hypogoal.domains.episodes import LAST, EpisodeRecorder
 from hypogoal.options.choosers import Outcome

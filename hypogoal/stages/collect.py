@@ -23,8 +23,9 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     ``domain`` is a name or, in Python, a ``Domain``, which later stages find by its own name, in this process only.
     ``out`` is an HDF5 file. ``resume`` keeps a complete file, and begins an unfinished one anew.
     """
-    from hypogoal.data import doubts_of, open_dataset, require_names, write_dataset
+    from hypogoal.data import open_dataset, write_dataset
     from hypogoal.domains.base import BUILT_IN, load_domain
+    from hypogoal.label_checks import doubts_of, require_names
     from hypogoal.look import count_lines
 
     name = _name_of(domain)

@@ -32,8 +32,8 @@ def evaluate(
     question's ``tables/*.csv``, ``run.json`` (what is missing, provenance) and ``arrays.h5``. If an experiment made the
     run, ``out`` also gets ``results.csv``.
     """
+    from hypogoal.core.hdf5 import create_hdf5
     from hypogoal.core.processes import prepare
-    from hypogoal.data import create_hdf5
     from hypogoal.evaluation import questions
     from hypogoal.evaluation.judging import Work
     from hypogoal.evaluation.run import find

@@ -50,8 +50,10 @@ def train_options(
             training.continue_with(loop, practice)
         solved = agents.learn(work, setup, loop, steps, config.until)
         recorder = loop.recorder
-        if setup.domain.measures and loop.engine.position_names:
-            away = distances_of(setup.domain, setup.source["sub_goals"], setup.members)
+        sub_goals = setup.source["sub_goals"]
+        knows_all = set(sub_goals) <= set(setup.domain.sub_goals)
+        if knows_all and setup.domain.measures and loop.engine.position_names:
+            away = distances_of(setup.domain, sub_goals, setup.members)
             recorder.write_executions(work.draft.files, away)
         if config.until:
             settings["ended_at"] = recorder.steps  # the manifest, which is written last, has these settings

@@ -17,7 +17,7 @@ from toy_data import reseal
 from hypogoal.core.artefacts import DATA, MANIFEST, Artefact, open_artefact
 from hypogoal.core.drafts import Draft, create
 from hypogoal.core.errors import Complete, UserError
-from hypogoal.data import create_hdf5
+from hypogoal.core.hdf5 import create_hdf5
 from hypogoal.evaluation.run import find_artefacts
 
 ABOUT: dict[str, Any] = {"kind": "meta", "config": {"steps": 3, "world": {"rooms": 2}}, "seed": 7}
@@ -54,6 +54,14 @@ def test_a_manifest_says_what_made_it(tmp_path: Path) -> None:
     assert {"python", "torch", "numpy"} <= artefact.manifest.versions.keys()
     assert 0 <= artefact.manifest.took["seconds"] < 60
     assert artefact.faults() == [] and find_artefacts(tmp_path, "meta")[0].path == out
+
+
+def test_artefacts_are_found_at_any_depth(tmp_path: Path) -> None:
+    """Cells may have names of any depth; drafts are hidden."""
+    deep = tmp_path / "meta" / "dbat" / "size-3" / "seed-0"
+    for out in (deep, tmp_path / "meta" / "dbat" / ".draft"):
+        finish(out)
+    assert [artefact.path for artefact in find_artefacts(tmp_path, "meta")] == [deep]
 
 
 def test_white_space_and_took_are_no_change(tmp_path: Path) -> None:

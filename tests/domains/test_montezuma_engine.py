@@ -77,6 +77,12 @@ def test_start_states_that_cannot_be(emulator: Emulator, monkeypatch: pytest.Mon
         make_starts(emulator, "1L", 4, seed=0)
 
 
+def test_a_memory_shorter_than_the_games_is_refused() -> None:
+    """Spec G2: else the first step would forget the states that other games are in."""
+    with pytest.raises(UserError, match="3 games need a memory of as many states: memory=2"):
+        MontezumaEngine("1L", 3, start_states=1, memory=2)
+
+
 # The environment
 
 

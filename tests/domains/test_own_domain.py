@@ -10,8 +10,9 @@ from command_line import run, settings
 import hypogoal
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.base import IMPORTED, load_domain, settings_of
 from hypogoal.films import agent_to_film, films_of
+from hypogoal.hypotheses.config import TrainEnsembleConfig
 
 pytestmark = pytest.mark.usefixtures("trusted")
 
@@ -58,3 +59,14 @@ def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path) -> None
     assert {*corridor_env.Mirrored.played} == {True}
     env = hypogoal.load_options(folder / "meta").make_env()
     assert env.unwrapped.mirrored
+
+
+def test_a_domain_that_does_not_load_is_no_missing_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its settings are not dropped without a word; data of a domain that is not installed is trained on without it."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "damaged_domain.py").write_text("import no_such_module\n")
+    settings_of(TrainEnsembleConfig, "train-ensemble", "not-installed")
+    settings_of(TrainEnsembleConfig, "train-ensemble", IMPORTED)
+    for name in ("damaged_domain:DOMAIN", "no_such_module:DOMAIN"):
+        with pytest.raises(UserError, match="the domain cannot be loaded: ModuleNotFoundError"):
+            settings_of(TrainEnsembleConfig, "train-ensemble", name)

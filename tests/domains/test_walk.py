@@ -137,6 +137,20 @@ def test_success_says_what_is_solved() -> None:
     assert rewarded is not None and rewarded.solved.sum() == 1
 
 
+def test_a_success_by_earlier_rewards_needs_a_function() -> None:
+    """A coin pays and the right end does not, so an episode's success is no matter of its last state."""
+
+    class Coin(CorridorEnv):
+        def step(self, action: int) -> Any:
+            image, _, over, cut, info = super().step(action)
+            return image, float(self.cell == 3), over, cut, info
+
+    with pytest.raises(UserError, match=r"succeeds by rewards before its last.*layout_seed=0, action=1.*success=f"):
+        engine_of(GymnasiumDomain(Coin, SUB_GOALS, plan=True)).plan()
+    plan = engine_of(GymnasiumDomain(Coin, SUB_GOALS, success=lambda *_: True, plan=True)).plan()
+    assert plan is not None and plan.solved.sum() == 1
+
+
 def test_no_plan_unless_asked_for() -> None:
     assert engine_of(corridor_env.DOMAIN).plan() is None
 

@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from corridor import LENGTH, Corridor
+from made_up import asked, results_of
+from made_up import row as row_of
 from numpy.typing import NDArray
 from option_loops import loop_of
 from planted import harsh, planted
@@ -15,6 +17,7 @@ from planted import harsh, planted
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Plan
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
+from hypogoal.evaluation import selection
 from hypogoal.evaluation.choosing import judge, qualities, with_choosers
 from hypogoal.evaluation.frozen import Choices, play
 from hypogoal.evaluation.names import UNIFORM
@@ -188,6 +191,17 @@ def test_counts_by_hand():
     np.testing.assert_allclose(found["preference"], [10 / 30, 50 / 20, np.nan, 1])
     np.testing.assert_allclose(found["chosen"], [10, 50, 0, 10])
     np.testing.assert_allclose(found["duration"], [5, 2, np.nan, 2])
+
+
+def test_the_first_run_is_that_of_the_smallest_number() -> None:
+    """Of seeds 2 and 10 it is 2, though as text 10 comes first."""
+    rows = []
+    for seed in (10, 2):
+        place = {"artefact": f"meta/seed-{seed}", "method": "D-BAT", "layout": 100, "seed": seed}
+        rows.append(row_of("preference", 1.0, **place, sub_goal="go-to-goal", member=0, scope=selection.SCOPE))
+    context = asked(selection, results_of(*rows))
+    assert context is not None
+    assert context["members"]["artefact"].tolist() == ["meta/seed-2"]
 
 
 def test_uniform_random_choice_stands_beside_the_agent_whose_options_it_has() -> None:

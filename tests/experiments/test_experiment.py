@@ -82,6 +82,16 @@ def test_a_command_for_each_point_of_its_axes(tmp_path: Path) -> None:
     assert len(cells_of(str(ROOT / "examples" / "sweep-doorkey.toml"))) == 1 + 4 + 8 + 4 + 2
 
 
+def test_an_axis_may_mix_integers_and_fractions(tmp_path: Path) -> None:
+    """The order of its values does not matter."""
+    command = "train-ensemble data.h5 --set learning_rate={rate}"
+    for axis in ("[1, 0.5]", "[0.5, 1]"):
+        row = f'name = "ensemble"\naxes = ["rate"]\ncommand = "{command}"'
+        text = f"format = 1\n[axes]\nrate = {axis}\n[[cells]]\n{row}"
+        cells = of_toml(tmp_path, text, "evaluate=false")
+        assert {cell.name for cell in cells} == {"ensemble/rate-0.5", "ensemble/rate-1.0"}
+
+
 NO_FUNCTION = [
     ('"collect doorkey"', '"rm -rf x"', "this is no stage"),
     ('"collect doorkey"', '"import x.npz"', "a cell must be able to go on after a break"),

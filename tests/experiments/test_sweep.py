@@ -11,7 +11,9 @@ import threading
 import time
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 from command_line import fails, refuses, run
 from toy import DATA, PLAY, SMALL, write_toy
@@ -127,6 +129,35 @@ def test_what_shares_its_work_among_the_cores_has_them_first(tmp_path: Path) -> 
     assert other.is_done
 
 
+@pytest.mark.parametrize(("workers", "shares"), [(0, "5 5 5"), (1, "16 16 16"), (2, "8 8 16"), (50, "5 5 5")])
+def test_cells_share_the_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int, shares: str) -> None:
+    """Three cells on sixteen cores: as many of them as may run at once leave no core without work."""
+    given = []
+
+    class AtOnce:
+        """A process that makes its cell's output at once."""
+
+        exitcode = 0
+
+        def __init__(self, target: object, args: tuple[list[str], Path, dict[str, str]]):
+            words, _, variables = args
+            self.out = Path(words[words.index("--out") + 1])
+            given.append(variables["HYPOGOAL_CORES"])
+
+        def start(self) -> None:
+            self.out.touch()
+
+        def join(self) -> None:
+            pass
+
+    monkeypatch.setattr(multiprocessing, "get_context", lambda kind: SimpleNamespace(Process=AtOnce))
+    monkeypatch.setattr("hypogoal.experiments.run.cores", lambda: 16)
+    cells = [Cell(name=name, words=["collect", "rooms"], run=tmp_path) for name in "abc"]
+    begin(cells, tmp_path)
+    run_local(cells, workers=workers, say=print, forked=False)
+    assert given == shares.split()
+
+
 def test_a_cell_that_crashes_goes_on(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where an emulator ends with a segmentation fault: said in a line, and the same bytes."""
     monkeypatch.setenv("HYPOGOAL_CHECKPOINT_SECONDS", "0")
@@ -163,6 +194,13 @@ command = "train-ensemble {{data}} {SMALL} --set sub_goals=nowhere"
 name = "lost"
 command = "train-meta {{worse}} {PLAY}"
 """
+
+
+def test_no_two_rows_of_results_differ_in_the_value_alone(whole: Path) -> None:
+    """An agent and uniform-random choice among its own options are two methods, so no mean mixes them."""
+    rows = pd.read_csv(whole / "out" / "evaluation" / "results.csv")
+    assert rows.loc[rows["stage"] == "train-meta", "measured_method"].nunique() > 1
+    assert not rows.drop(columns="value").duplicated().any()
 
 
 def test_a_cell_begun_otherwise_is_told_as_a_part_of_its_run(whole: Path, out: Path) -> None:

@@ -199,6 +199,12 @@ class LongCorridorDomain(Domain):
 DOMAIN = LongCorridorDomain()
 
 
+class Relabelled(LongCorridorDomain):
+    """What an ensemble of the user's own labels says of its domain, which is ``DOMAIN``."""
+
+    sub_goals = ("mine",)
+
+
 pytestmark = pytest.mark.usefixtures("trusted")  # manifests here name this module's domain
 
 
@@ -226,6 +232,13 @@ def test_options_from_a_named_start(corridor: Path, tmp_path: Path) -> None:
     assert not any(row["inside_at_start"] for row in rows)
     last = json.loads((tmp_path / "options" / "metrics.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 800 and {"reached", "terminated", "duration", "option_loss"} <= set(last)
+
+
+def test_distances_to_unknown_sub_goals_are_not_written(tmp_path: Path) -> None:
+    """Spec F3: of a sub-goal of the user's own labels the domain does not know the place."""
+    ensemble = untrained(tmp_path / "ensemble", Relabelled(), members=1, network="mlp")
+    train(ensemble, tmp_path / "options", start="middle", termination="learned")
+    assert not (tmp_path / "options" / Executions.FILE).exists()
 
 
 def test_a_start_must_be_one_of_the_domains(corridor: Path, tmp_path: Path) -> None:

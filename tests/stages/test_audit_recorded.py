@@ -19,7 +19,7 @@ from torch import nn
 from hypogoal.cli import main
 from hypogoal.core.artefacts import TO_FILL_IN, open_artefact
 from hypogoal.core.errors import UserError
-from hypogoal.data import open_dataset
+from hypogoal.data import Collected, States, open_dataset, write_dataset
 from hypogoal.evaluation.page import lines_of
 from hypogoal.evaluation.pictures import picture_of
 from hypogoal.hypotheses.labelling import density_of, disagreement, sketches_of, to_label
@@ -53,6 +53,11 @@ def often(observations: Any) -> NDArray[np.float64]:
     return (observations["state"].mean(axis=1) > 0).astype(np.float64)
 
 
+def certain(observations: Any) -> NDArray[np.float64]:
+    """A success everywhere."""
+    return np.ones(len(observations))
+
+
 def test_a_function_is_audited_on_labels_by_hand(mixed_run: Path, tmp_path: Path, capsys: Any) -> None:
     """Its share of known failures is that of the data; a larger one than allowed is exit code 3, and one JSON line."""
     data = open_dataset(mixed_run / "data.h5")
@@ -70,6 +75,25 @@ def test_a_function_is_audited_on_labels_by_hand(mixed_run: Path, tmp_path: Path
             "out": str(out), "false_positives": {"failures": pytest.approx(share)}, "fail_above": limit,
             "failed": code == 3,
         }  # fmt: skip
+
+
+def test_the_help_says_of_what_the_share_is() -> None:
+    """In play of executions and of states met; on recorded data of known failures, as :func:`audited` counts them."""
+    text = " ".join(run("audit", "--help").out.replace("│", " ").split())
+    assert "in play, of executions or of states met" in text
+    assert "on recorded data, of states labelled as failures" in text
+
+
+def test_what_nobody_could_measure_is_no_share(tmp_path: Path, capsys: Any) -> None:
+    """Without a known failure there is no share: exit code 3, and the line says why."""
+    data = tmp_path / "data.h5"
+    states = States(np.zeros((3, 4), np.float32), np.ones((3, 1), bool), {})
+    write_dataset(data, Collected((4,), (GOAL,), states, states, states), domain="", config={}, seed=0)
+    words = ["audit", f"{__name__}:certain", "--data", str(data), "--out", str(tmp_path / "audit")]
+    assert main([*words, "--fail-above", "0.1"]) == 3
+    printed = capsys.readouterr().out
+    assert "FAILED: there was nothing to count false positives among: failures" in printed
+    assert "more than" not in printed
 
 
 torch.manual_seed(0)

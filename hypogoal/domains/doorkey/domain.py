@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from hypogoal.core.config import Config, Values, setting
-from hypogoal.data import Collected, States, joined, leave_out, require_classes
+from hypogoal.data import Collected, States, joined, leave_out
 from hypogoal.domains.base import EQUATION_1, Domain
 from hypogoal.domains.doorkey import env
 from hypogoal.domains.doorkey.engine import DoorKeyEngine
+from hypogoal.label_checks import require_classes
 
 
 class DoorKeyConfig(Config):

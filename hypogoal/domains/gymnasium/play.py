@@ -13,8 +13,9 @@ from numpy.random import Generator
 from hypogoal.core.arrays import Bools
 from hypogoal.core.errors import UserError
 from hypogoal.core.seeding import rng_for
-from hypogoal.data import GET_MORE, PLANTED, Collected, States, Unmet, require_classes
+from hypogoal.data import PLANTED, Collected, States
 from hypogoal.domains.gymnasium.engine import ask_labels
+from hypogoal.label_checks import GET_MORE, Unmet, require_classes
 from hypogoal.observations import Observations, digest
 
 if TYPE_CHECKING:

@@ -102,7 +102,10 @@ class Walk:
         return state
 
     def _play(self, state: int, action: int, seed: int) -> tuple[int, bool]:
-        """Take a step. Return the state reached, and whether the episode is over."""
+        """Take a step. Return the state reached, and whether the episode is over.
+
+        Raises ``UserError`` if the episode is a success, but not by the reward of this step.
+        """
         observation, reward, terminated, cut, info = self.env.step(action)
         last = float(reward)
         self.earned += last
@@ -114,6 +117,12 @@ class Walk:
             self.final.add(after)
             self.following[after] = [after] * self.engine.n_actions
             success = self.engine.domain.success
+            if success is None and self.earned > 0 >= last:
+                raise UserError(
+                    "an episode succeeds by rewards before its last, so the states that solve the task are not known",
+                    f"layout_seed={seed}, action={action}",
+                    "Give success=f, a function that says at an episode's end whether it was a success.",
+                )
             if success(self.env, info, self.earned, True) if success else last > 0:
                 self.solved.add(after)
         return after, bool(terminated or cut)

@@ -175,7 +175,7 @@ class MontezumaDomain(Domain[MontezumaConfig]):
         return "Reach a sub-goal, such as the base of a ladder, from a start; a lost life ends the episode."
 
     def distance_to(self, sub_goal: str, positions: Ints) -> Ints:
-        return distance_to(positions, SUB_GOALS.get(sub_goal, CLIMB_DOWN).places)
+        return distance_to(positions, SUB_GOALS[sub_goal].places)
 
     def picture(self, room: int) -> Bytes:
         return game.picture(game.Emulator(), room)

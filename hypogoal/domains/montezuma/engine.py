@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hypogoal.core.arrays import Bools, Ints
+from hypogoal.core.errors import UserError
 from hypogoal.core.processes import cores
 from hypogoal.core.seeding import rng_for
 from hypogoal.domains.base import Step, TurnEngine
@@ -29,7 +30,8 @@ class MontezumaEngine(TurnEngine):
     and ``memory`` must be at least ``count``. Positions and labels are available for all states.
 
     The arguments are those of ``MontezumaLadder``, and ``count``, the number of environments (E). ``seed`` is the seed
-    of the start states, and of the draw of a start state for each episode.
+    of the start states, and of the draw of a start state for each episode. Raises ``UserError`` if the memory is too
+    small.
     """
 
     CHANGING = (*TurnEngine.CHANGING, "_rng")
@@ -50,6 +52,8 @@ class MontezumaEngine(TurnEngine):
         seed: int = 0,
     ):
         super().__init__()
+        if memory < count:
+            raise UserError(f"{count} games need a memory of as many states", f"memory={memory}", "Give a larger one.")
         self.count, self.max_steps = count, max_steps
         self.memory = self.room = memory
         self._emulators = [game.Emulator() for _ in range(count)]
