@@ -227,7 +227,7 @@ def tables(path: Path) -> Iterator[str]:
         "layouts on which it takes longer than D-BAT",
         "solved at the end",
         "length / shortest, median",
-        "lowest share solved after that",
+        "lowest share solved after that, of all layouts",
         "layouts on which that is .90 or more",
     ]
     yield from table(titles, (training(method) for method in methods))
