@@ -24,7 +24,7 @@ from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
 from benchmarks.options import config_of, played, update  # noqa: E402
 from benchmarks.training import states  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
-from hypogoal.domains.base import settings_of  # noqa: E402
+from hypogoal.domains.find import settings_of  # noqa: E402
 from hypogoal.hypotheses.config import TrainEnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.training import EnsembleTraining  # noqa: E402
 

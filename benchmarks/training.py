@@ -29,7 +29,7 @@ from torch.nn import functional  # noqa: E402
 from hypogoal.core.processes import prepare  # noqa: E402
 from hypogoal.data import States, open_dataset  # noqa: E402
 from hypogoal.diversity.dbat import pair_loss  # noqa: E402
-from hypogoal.domains.base import settings_of  # noqa: E402
+from hypogoal.domains.find import settings_of  # noqa: E402
 from hypogoal.hypotheses.config import EnsembleConfig, TrainEnsembleConfig  # noqa: E402
 from hypogoal.hypotheses.networks import build_network, network_for  # noqa: E402
 from hypogoal.hypotheses.training import EnsembleTraining  # noqa: E402

@@ -98,7 +98,7 @@ def command_line() -> str:
 def settings() -> str:
     """What ``hypogoal config`` says of every stage: a table a stage, a column for each domain's default."""
     from hypogoal.core.presets import TABLES
-    from hypogoal.domains.base import BUILT_IN
+    from hypogoal.domains.find import BUILT_IN
 
     lines = [
         "# Settings",
@@ -120,7 +120,7 @@ def settings() -> str:
 def settings_of(stage: str) -> list[dict[str, Any]]:
     """The settings of a stage, each by the domains that have it. What means something else elsewhere is another one."""
     from hypogoal.core.presets import described
-    from hypogoal.domains.base import BUILT_IN, layers_of
+    from hypogoal.domains.find import BUILT_IN, layers_of
     from hypogoal.experiments.experiment import config_class_of
 
     found: dict[tuple[str, str], dict[str, Any]] = {}
@@ -150,7 +150,7 @@ def _documented(entry: str | tuple[str, str]) -> list[str]:
 
 def _row(by_domain: dict[str, Any]) -> str:
     """A row of a table: a setting, its default on each domain, what it means and where the defaults come from."""
-    from hypogoal.domains.base import BUILT_IN
+    from hypogoal.domains.find import BUILT_IN
 
     row = next(iter(by_domain.values()))
     allowed = f" ({row['allowed']})" if row["allowed"] else ""

@@ -225,7 +225,7 @@ def config(
 ) -> None:
     """List every setting of a stage, with default, unit, meaning and source."""
     from hypogoal.core import presets
-    from hypogoal.domains import base as domains
+    from hypogoal.domains import find as domains
     from hypogoal.experiments.experiment import config_class_of
 
     rows = presets.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))
@@ -281,7 +281,7 @@ def check(
     from hypogoal import check as contracts
     from hypogoal.core import config as settings
     from hypogoal.data import open_dataset
-    from hypogoal.domains import base as domains
+    from hypogoal.domains import find as domains
     from hypogoal.hypotheses.config import TrainEnsembleConfig
 
     checks = []

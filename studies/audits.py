@@ -34,7 +34,7 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 from hypogoal.domains.gymnasium.domain import GymnasiumDomain
 from studies.cells import table
 

@@ -28,7 +28,8 @@ import torch
 
 import hypogoal
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Layouts, load_domain
+from hypogoal.domains.base import Layouts
+from hypogoal.domains.find import load_domain
 from hypogoal.options.tables import Episodes
 from studies.cells import Jobs, Row, parser_of, printed, read_rows, run_cells, share, table
 from studies.misgeneralise import FEATURES, LEVELS, METHODS, WORLDS, data_of, levels

@@ -22,7 +22,7 @@ import hypogoal
 from hypogoal.core.drafts import create
 from hypogoal.core.seeding import torch_generator
 from hypogoal.data import open_dataset
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 from hypogoal.hypotheses.ensemble import Ensemble, write_ensemble
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,7 +14,7 @@ import hypogoal
 from hypogoal.core import own_code
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import surroundings
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENT = """

@@ -16,7 +16,8 @@ from hypogoal.core.config import Config
 from hypogoal.core.seeding import rng_for, torch_generator
 from hypogoal.core.tensors import stored
 from hypogoal.data import Collected
-from hypogoal.domains.base import Domain, load_domain
+from hypogoal.domains.base import Domain
+from hypogoal.domains.find import load_domain
 from hypogoal.hypotheses import views
 from hypogoal.hypotheses.config import EnsembleConfig
 from hypogoal.hypotheses.deep_lift import method_of

@@ -15,7 +15,8 @@ from hypogoal.check.domains import SEEDED, require_same
 from hypogoal.check.verdict import Verdict, promise, verdicts
 from hypogoal.core.arrays import Floats, Ints
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.domains.base import Domain, Engine, load_domain
+from hypogoal.domains.base import Domain, Engine
+from hypogoal.domains.find import load_domain
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup, assemble
 from hypogoal.observations import PICTURE, standard_of

@@ -52,7 +52,7 @@ class Call:
 
     def settings(self, kind: type["C"], domain: str, inherited: Mapping[str, Any] | None = None) -> "C":
         """Return the stage's settings: defaults, the domain's, the preset's, those of continued options, typed ones."""
-        from hypogoal.domains.base import settings_of
+        from hypogoal.domains.find import settings_of
 
         return settings_of(kind, self.stage, domain, self.preset, self.typed, inherited=inherited)
 

@@ -1,4 +1,4 @@
-"""The interface of a domain, and how a domain is found by its name."""
+"""The interface of a domain and of its engines. ``domains.find`` finds a domain by its name."""
 
 from __future__ import annotations
 
@@ -10,27 +10,17 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from hypogoal.core import own_code
 from hypogoal.core.arrays import Bools, Bytes, Doubles, Floats, Ints
-from hypogoal.core.checkpoints import Resumable, State
-from hypogoal.core.config import C, Values, model_of, resolve
-from hypogoal.core.errors import NotInstalled, UserError
-from hypogoal.core.presets import preset
+from hypogoal.core.checkpoints import Resumable
+from hypogoal.core.config import C, Values, resolve
+from hypogoal.core.errors import UserError
 from hypogoal.data import Collected
 from hypogoal.observations import PICTURE, DType, Observations, Shape, Standard
 
 if TYPE_CHECKING:
     import gymnasium
 
-BUILT_IN = {
-    "doorkey": "hypogoal.domains.doorkey.domain:DOMAIN",
-    "montezuma": "hypogoal.domains.montezuma.domain:DOMAIN",
-    "rooms": "hypogoal.domains.rooms.domain:DOMAIN",
-}
-ENTRY_POINTS = "hypogoal.domains"
-REGISTERED: dict[str, Domain] = {}  # domains that the running program defined, by name
 EQUATION_1 = {"schedule": "simultaneous", "restarts": 1, "share": "labels"}  # for train-ensemble, beside the weight
-IMPORTED = "imported"  # the name of the domain of states that 'hypogoal import' got without --domain
 
 
 class Step(NamedTuple):
@@ -206,93 +196,6 @@ class Engine(Resumable, ABC):
         return None
 
 
-class TurnEngine(Engine):
-    """An engine that steps its environments one after the other, and keeps what was seen in the newest states.
-
-    Subclasses define how an episode begins and how a step is played. A step is in plain Python, because NumPy's
-    operations slow down an emulator's next frames (see ``montezuma.emulator``).
-
-    Attributes:
-        room: the number of states, besides start states, of which is kept what was seen.
-        width: the number of bytes of the facts that are kept of every state.
-    """
-
-    restarts = resumes = True
-    room: int
-    width: int
-
-    def __init__(self) -> None:
-        self._seen: dict[int, Any] = {}  # what was seen, by state, in the order of states
-        self._facts = bytearray()
-
-    @property
-    def n_states(self) -> int:
-        return len(self._facts) // self.width
-
-    @property
-    def oldest(self) -> int:
-        return max(len(self.starts), self.n_states - self.room)
-
-    @property
-    def kept(self) -> list[int]:
-        """The states of which is kept what was seen, in order."""
-        return [*range(len(self.starts)), *range(self.oldest, self.n_states)]
-
-    def _add(self, seen: Any, facts: bytes) -> int:
-        """Keep what was seen in a new state, and the state's facts. Return the state's id."""
-        state = self.n_states
-        self._seen[state] = seen
-        self._facts += facts
-        forgotten = state - self.room
-        if forgotten >= len(self.starts):
-            del self._seen[forgotten]
-        return state
-
-    def read_facts(self, ids: Ints | Sequence[int]) -> Bytes:
-        """Return the facts of states, uint8 (n, ``width``), also of forgotten states."""
-        every = np.frombuffer(self._facts, np.uint8)
-        return every.reshape(-1, self.width)[ids]
-
-    def images(self, ids: Ints) -> Observations:
-        """Return observations as ``Engine.images`` does. Raises ``ValueError`` if a state is unknown or forgotten."""
-        images = np.empty((len(ids), *self.observation_shape), self.observation_dtype)
-        for row, state in enumerate(ids.tolist()):
-            if state not in self._seen:
-                raise ValueError(f"state {state} is unknown, or forgotten: the engine keeps the last {self.room}")
-            images[row] = self._image(self._seen[state])
-        return images
-
-    def _image(self, seen: Any) -> Any:
-        """Return the observation of a state, made of what was seen in the state."""
-        return seen
-
-    def snapshot(self) -> State:
-        return super().snapshot() | {"facts": np.frombuffer(self._facts, np.uint8).copy()}
-
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        super().restore(snapshot)
-        self._facts = bytearray(snapshot["facts"].tobytes())
-
-    @abstractmethod
-    def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
-        """Play step number ``elapsed`` of one environment's episode. Return the environment's entries of a ``Step``."""
-
-    def step(self, actions: Ints) -> Step:
-        elapsed = [steps + 1 for steps in self.elapsed.tolist()]
-        outcomes = []
-        ids = []
-        for number, action in enumerate(actions.tolist()):
-            outcome = self._play(number, action, elapsed[number])
-            outcomes.append(outcome)
-            state, _reward, terminated, truncated, *_ = outcome
-            if terminated or truncated:
-                state, elapsed[number] = self._begin(number), 0
-            ids.append(state)
-        self.ids, self.elapsed = np.array(ids), np.array(elapsed)
-        following, rewards, *others = map(np.array, zip(*outcomes, strict=True))
-        return Step(following, rewards.astype(np.float32), *others)
-
-
 class Domain(ABC, Generic[C]):
     """All that hypogoal needs to know about a domain.
 
@@ -391,73 +294,3 @@ class Domain(ABC, Generic[C]):
     def pixel(self, positions: Ints) -> Doubles:
         """Return the column and row of positions in the room's picture, (n, 2). The domain must have ``pictures``."""
         raise NotImplementedError
-
-
-def load_domain(name: str) -> Domain:
-    """Load a domain by name.
-
-    The name is that of a built-in domain, of an installed entry point (group ``hypogoal.domains``), or
-    ``module:object``. The user's own code that the domain's defaults name, such as a network, is allowed together with
-    the domain. Raises ``UserError`` if the user did not allow the domain's code (see :mod:`hypogoal.core.own_code`), or
-    if the object is no domain.
-    """
-    name = "rooms" if name == "which-feature" else name  # the name of rooms in files of version 0.23
-    domain = REGISTERED.get(name)
-    if domain is None and name == IMPORTED:
-        raise NotInstalled(
-            "the domain of these imported states is not known",
-            name,
-            f"Import them again with --domain, one of {', '.join(BUILT_IN)} or module:object, and train on that file.",
-        )
-    domain = domain or own_code.load(name, "domain", ENTRY_POINTS, BUILT_IN)
-    if not isinstance(domain, Domain):
-        raise UserError("the object is not a domain", name, "Derive it from hypogoal.domains.base.Domain.")
-    for settings in domain.defaults.values():
-        own_code.allow(settings.values())
-    return domain
-
-
-def installed_domain(name: str) -> Domain | None:
-    """Return a domain as :func:`load_domain` does, or None if no domain of that name is installed.
-
-    A user's data may name a domain that is not installed. Raises ``UserError`` if the user did not allow the code, or
-    if the code cannot be loaded.
-    """
-    try:
-        return load_domain(name)
-    except NotInstalled:
-        return None
-
-
-def layers_of(stage: str, domain: str, preset_name: str | None) -> list[tuple[Values, str]]:
-    """Return the values that replace the defaults of a stage's settings, with their source, in order.
-
-    The domain's own values come first, then those of a preset.
-    """
-    installed = installed_domain(domain)
-    layers = []
-    if installed:
-        layers.append((installed.defaults.get(stage, {}), installed.sources.get(stage, f"{domain}'s own")))
-    return [*layers, (preset(preset_name, stage, domain), f"preset {preset_name}")]
-
-
-def settings_of(
-    kind: type[C],
-    stage: str,
-    domain: str,
-    preset_name: str | None = None,
-    typed: Values | None = None,
-    *,
-    inherited: Values | None = None,
-) -> C:
-    """Return the settings of a stage on a domain.
-
-    The domain's values replace the defaults. Then follow a preset's values, then ``inherited``, the settings of the
-    options that the stage continues, and then what the user ``typed``. Raises ``UserError`` if a name is unknown, or if
-    a value is not allowed.
-    """
-    model = load_domain(domain).config_class if stage == "collect" else model_of(stage)
-    layers = [values for values, _ in layers_of(stage, domain, preset_name)]
-    settings = resolve(model, *layers, inherited or {}, typed or {}, stage=stage)
-    assert isinstance(settings, kind)
-    return settings

@@ -16,7 +16,7 @@ import pandas as pd
 
 from hypogoal.core.arrays import Doubles, Ints
 from hypogoal.core.artefacts import Artefact
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 from hypogoal.evaluation import statistics, table
 from hypogoal.evaluation.names import UNIFORM
 from hypogoal.evaluation.run import choice_of

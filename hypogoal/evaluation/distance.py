@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from hypogoal.core.arrays import Bytes
-from hypogoal.domains.base import installed_domain
 from hypogoal.domains.episodes import LAST
+from hypogoal.domains.find import installed_domain
 from hypogoal.evaluation import plots
 from hypogoal.evaluation.hypotheses import VALIDATED
 from hypogoal.evaluation.names import ORACLE

@@ -11,7 +11,8 @@ import numpy as np
 from hypogoal.core.arrays import Bytes, Doubles, Ints
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains import base
+from hypogoal.domains import find
+from hypogoal.domains.base import Engine, Layouts
 from hypogoal.evaluation import page, plots
 from hypogoal.evaluation.curves import chosen_by
 from hypogoal.evaluation.pictures import overlay
@@ -78,7 +79,7 @@ def on_layout(
     from hypogoal.hypotheses.ensemble import read_ensemble  # with PyTorch, which a report does not need
 
     config = Artefact(path).config
-    in_domain = base.load_domain(config["domain"]).sub_goals
+    in_domain = find.load_domain(config["domain"]).sub_goals
     engine = engine_on(config, layouts)
     ids = engine.reachable()
     if ids is None:
@@ -101,17 +102,17 @@ def on_layout(
     return np.concatenate(matches), sets
 
 
-def engine_on(config: Mapping[str, Any], layouts: Sequence[int]) -> base.Engine:
+def engine_on(config: Mapping[str, Any], layouts: Sequence[int]) -> Engine:
     """Return an engine with a game on each of ``layouts``, in the world that an artefact's ``config`` says."""
-    domain = base.load_domain(config["domain"])
+    domain = find.load_domain(config["domain"])
     world = domain.world(config["domain_config"])
     if len(layouts) > 1:
-        world["layouts"] = base.Layouts(layouts)
+        world["layouts"] = Layouts(layouts)
     return domain.make_engine(layouts[0], len(layouts), 500, **world)
 
 
 def states_met(
-    engine: base.Engine,
+    engine: Engine,
     steps: int,
     rng: np.random.Generator,
 ) -> Ints:
@@ -127,7 +128,7 @@ def missing(work):
     lines = set()
     for artefact in filter(takes, work.contents.agents):
         name = artefact.config["domain"]
-        in_domain = base.load_domain(name).sub_goals
+        in_domain = find.load_domain(name).sub_goals
         for sub_goal in set(artefact.config["sub_goals"]).difference(in_domain):
             lines.add(f"no truth of {sub_goal} to match members with: {name} has {page.listed(in_domain)}")
     return sorted(lines)

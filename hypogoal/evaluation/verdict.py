@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from hypogoal.domains.base import installed_domain
+from hypogoal.domains.find import installed_domain
 from hypogoal.evaluation.choosing import FROZEN
 from hypogoal.evaluation.curves import chosen_by
 from hypogoal.evaluation.hypotheses import VALIDATED

@@ -13,7 +13,8 @@ import pandas as pd
 
 from hypogoal.core.arrays import Doubles
 from hypogoal.core.artefacts import Artefact
-from hypogoal.domains.base import Engine, load_domain
+from hypogoal.domains.base import Engine
+from hypogoal.domains.find import load_domain
 from hypogoal.evaluation.choosing import with_choosers
 from hypogoal.evaluation.curves import scores
 from hypogoal.evaluation.names import UNIFORM

@@ -30,7 +30,7 @@ from hypogoal.core import own_code
 from hypogoal.core.config import DOMAIN, MODELS, STAGES, Config, Values, model_of, setting
 from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 
 STAGE = "stage"  # an argument that gives a stage's settings, as in stage("train-meta").steps, and is none itself
 LAYOUTS = "layouts, each with an agent of its own"

@@ -13,7 +13,7 @@ from hypogoal.core.config import DOMAIN, STAGES, Config, assigned, resolve
 from hypogoal.core.errors import UserError, reason
 from hypogoal.core.own_code import allow
 from hypogoal.core.presets import preset as read_preset
-from hypogoal.domains.base import settings_of
+from hypogoal.domains.find import settings_of
 from hypogoal.experiments.experiment import STAGE, Command, find_experiment
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 

@@ -10,7 +10,8 @@ from hypogoal.core.arrays import Ints
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.config import known, resolve
 from hypogoal.core.tensors import load_tensors
-from hypogoal.domains.base import Layouts, load_domain
+from hypogoal.domains.base import Layouts
+from hypogoal.domains.find import load_domain
 from hypogoal.meta.config import TrainMetaConfig
 from hypogoal.meta.setup import Setup, assemble
 from hypogoal.meta.training import continue_with

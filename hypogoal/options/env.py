@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 from hypogoal.hypotheses.ensemble import Ensemble
 from hypogoal.observations import Observations
 from hypogoal.options.loop import offered_options

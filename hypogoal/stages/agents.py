@@ -10,7 +10,7 @@ from hypogoal.command.call import Call, Training
 from hypogoal.core.artefacts import Artefact, open_artefact, sha256_of
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import save_tensors
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 from hypogoal.domains.world import write_layout
 from hypogoal.meta.config import PlayConfig
 from hypogoal.meta.nearness import nearness

@@ -24,7 +24,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
     ``out`` is an HDF5 file. ``resume`` keeps a complete file, and begins an unfinished one anew.
     """
     from hypogoal.data import open_dataset, write_dataset
-    from hypogoal.domains.base import BUILT_IN, load_domain
+    from hypogoal.domains.find import BUILT_IN, load_domain
     from hypogoal.label_checks import doubts_of, require_names
     from hypogoal.look import count_lines
 
@@ -53,7 +53,7 @@ def collect(call: Call, domain: Annotated[str, Argument(help=DOMAINS)]) -> Done:
 
 def _name_of(domain: Any) -> str:
     """Return the name by which later stages find a domain."""
-    from hypogoal.domains.base import BUILT_IN, REGISTERED, load_domain
+    from hypogoal.domains.find import BUILT_IN, REGISTERED, load_domain
 
     if isinstance(domain, str):
         return domain

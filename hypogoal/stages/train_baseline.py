@@ -32,7 +32,7 @@ def train_baseline(
     from hypogoal.core.tensors import save_tensors
     from hypogoal.data import open_dataset
     from hypogoal.domains import world
-    from hypogoal.domains.base import load_domain
+    from hypogoal.domains.find import load_domain
     from hypogoal.observations import PICTURE, standard_of
     from hypogoal.options.tables import Episodes
 

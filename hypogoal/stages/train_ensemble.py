@@ -44,7 +44,7 @@ def train_ensemble(
     """
     from hypogoal.core.processes import allowed, in_processes
     from hypogoal.data import open_dataset
-    from hypogoal.domains.base import installed_domain
+    from hypogoal.domains.find import installed_domain
     from hypogoal.hypotheses.config import TrainEnsembleConfig
     from hypogoal.hypotheses.sub_goals import Trained, checked, log_of, train_sub_goal
     from hypogoal.observations import type_text

@@ -81,7 +81,7 @@ def _in_play(
     """Train and play the policies. Return the findings in lines, and the shares of false positives."""
     from hypogoal.core.files import as_json
     from hypogoal.core.seeding import rng_for
-    from hypogoal.domains.base import load_domain
+    from hypogoal.domains.find import load_domain
     from hypogoal.domains.world import columns_of
     from hypogoal.evaluation.page import lines_of
     from hypogoal.meta.config import AuditConfig

@@ -56,7 +56,7 @@ def import_data(
     from hypogoal import look
     from hypogoal.core.artefacts import DATA, kind_of
     from hypogoal.data import write_dataset
-    from hypogoal.domains.base import IMPORTED
+    from hypogoal.domains.find import IMPORTED
     from hypogoal.importing.assemble import assemble
     from hypogoal.importing.labels import add_labels, labels_of
     from hypogoal.importing.pictures import POSITIVE, read_pictures

@@ -22,8 +22,8 @@ from hypogoal.core.config import (
 )
 from hypogoal.core.errors import UserError
 from hypogoal.core.presets import TABLES, as_toml, described, preset
-from hypogoal.domains.base import settings_of
 from hypogoal.domains.doorkey.domain import DoorKeyConfig
+from hypogoal.domains.find import settings_of
 from hypogoal.experiments.experiment import config_class_of
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.meta.config import MetaConfig, TrainMetaConfig

@@ -11,7 +11,7 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 from hypogoal.core.seeding import rng_for
 from hypogoal.data import Collected, States
-from hypogoal.domains.base import settings_of
+from hypogoal.domains.find import settings_of
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma import states as montezuma_states
 from hypogoal.domains.montezuma.domain import DOMAIN, MontezumaConfig

@@ -10,7 +10,7 @@ from command_line import run, settings
 import hypogoal
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.domains.base import IMPORTED, load_domain, settings_of
+from hypogoal.domains.find import IMPORTED, load_domain, settings_of
 from hypogoal.films import agent_to_film, films_of
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 

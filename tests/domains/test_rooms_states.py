@@ -7,7 +7,7 @@ from minigrid.core.world_object import Ball, Key, Wall
 from scipy.stats import binomtest
 
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import load_domain
+from hypogoal.domains.find import load_domain
 from hypogoal.domains.rooms.domain import DOMAIN
 from hypogoal.domains.rooms.engine import DECKS
 from hypogoal.domains.rooms.states import (

@@ -17,7 +17,7 @@ import torch
 from own_domain import CorridorDomain
 
 import hypogoal
-from hypogoal.domains import base
+from hypogoal.domains import find
 
 WITH_WEIGHTS = "*.safetensors"
 
@@ -34,7 +34,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path = tmp_path_factory.mktemp("data") / "data.h5"
     hypogoal.collect(Walked(), out=path, copies=9, quiet=True)
     yield path
-    del base.REGISTERED[Walked.name]
+    del find.REGISTERED[Walked.name]
 
 
 def weights(folder: Path) -> dict[str, bytes]:

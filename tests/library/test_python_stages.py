@@ -13,7 +13,7 @@ import hypogoal
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.data import open_dataset
-from hypogoal.domains import base
+from hypogoal.domains import find
 
 NAME = "corridor-here"
 FEW = {"steps": 10, "workers": 1, "members": 2, "quiet": True}
@@ -71,7 +71,7 @@ def test_domains_of_another_program_and_of_another_name(tmp_path: Path) -> None:
     data = hypogoal.collect(Here(), out=tmp_path / "data.h5", quiet=True)
     ensemble = hypogoal.train_ensemble(data, out=tmp_path / "ensemble", **FEW)
     assert open_dataset(data.path).domain == open_artefact(ensemble.path).config["domain"] == NAME
-    del base.REGISTERED[NAME]  # as in another program
+    del find.REGISTERED[NAME]  # as in another program
     with pytest.raises(UserError, match="unknown domain"):
         hypogoal.train_options(ensemble, out=tmp_path / "out", **PLAY)
     domain = own_domain.CorridorDomain()

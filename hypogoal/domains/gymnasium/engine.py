@@ -11,8 +11,9 @@ import numpy as np
 from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.checkpoints import ANEW, State
 from hypogoal.core.errors import UserError
-from hypogoal.domains.base import Layouts, Plan, TurnEngine
+from hypogoal.domains.base import Layouts, Plan
 from hypogoal.domains.gymnasium.walk import Walk
+from hypogoal.domains.turns import TurnEngine
 from hypogoal.observations import DIGEST, digest
 
 if TYPE_CHECKING:

@@ -15,10 +15,11 @@ from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.errors import UserError
 from hypogoal.core.processes import cores
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Step, TurnEngine
+from hypogoal.domains.base import Step
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.env import MAX_STEPS, START_STATES, make_starts
 from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, judge_sub_goals
+from hypogoal.domains.turns import TurnEngine
 
 MEMORY = 110_000  # states, for the replay of Table 2 (1e5 transitions) and those that are not yet in the replay
 
