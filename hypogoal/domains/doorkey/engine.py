@@ -9,48 +9,65 @@ change the configuration. Such changes are rare, so plain Python computes them. 
 """
 
 from collections.abc import Mapping, Sequence
+from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
+from minigrid.core.actions import Actions
+from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.random import Generator
 
 from hypogoal.core.arrays import Array, Bools, Bytes, Ints
 from hypogoal.domains.base import Engine, Layouts, Plan, Step
 from hypogoal.domains.doorkey.env import (
+    DOOR_COLOUR,
+    KEY_COLOURS,
     MAX_STEPS,
     OBSERVATION_SHAPE,
     SIZE,
     judge_sub_goals,
     make_layout,
 )
-from hypogoal.domains.doorkey.tables import (
-    AGENT_ON,
-    AHEAD,
-    CELLS,
-    CLOSED,
-    DOOR,
-    DROP,
-    GOAL,
-    HELD,
-    KEY,
-    KEY_BITS,
-    LOCKED,
-    MAY_CHANGE,
-    MOVES,
-    N_ACTIONS,
-    N_CODES,
-    OPEN,
-    PICKUP,
-    POSES,
-    SEARCHED,
-    STRIP,
-    TOGGLE,
-    WALL,
-    tiles,
-)  # fmt: skip
+from hypogoal.domains.tiles import TILE, draw_tiles
 
+N_ACTIONS = len(Actions)
+LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = map(int, Actions)
+SEARCHED = np.delete(np.arange(N_ACTIONS), DROP)  # the actions tried in the search for reachable states
+CELLS = SIZE * SIZE
+POSES = CELLS * 4  # pose = cell * 4 + direction; a power of two
+HELD = CELLS  # a key's place is its cell, or HELD + its rank on the ring, where rank 0 was picked up first
+KEY_BITS = np.array([1, 2, 4])  # of the blue, the green and the red key
+OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers for a door
 START = 0  # the id of the start state; with several layouts, of the start state of the first layout played
 UNKNOWN = -1
+
+# One byte per cell encodes its picture.
+EMPTY, WALL, GOAL = 0, 1, 2
+KEY = 3  # plus 0, 1, 2: blue, green, red
+DOOR = 6  # plus OPEN, CLOSED, LOCKED
+AGENT = 9  # plus the direction; plus 0, 4, 8: on the floor, in the open door, on the goal
+N_CODES = AGENT + 12
+AGENT_ON = np.zeros(N_CODES, np.uint8)
+AGENT_ON[EMPTY] = AGENT  # plus the direction
+AGENT_ON[DOOR + OPEN] = AGENT + 4
+AGENT_ON[GOAL] = AGENT + 8
+
+# MiniGrid's rules as tables. They are read flat, because one index into a table is several times faster than two.
+_POSE = np.arange(POSES)
+_CELL, _DIRECTION = np.divmod(_POSE, 4)
+_ONE_ON = np.array((1, SIZE, -1, -SIZE))  # what to add to a cell to get the next cell, by direction
+AHEAD = np.clip(_CELL + _ONE_ON[_DIRECTION], 0, CELLS - 1)  # the cell in front of each pose
+# MOVES is what to add to the pose, by action, code ahead and pose. MAY_CHANGE is whether the configuration may change.
+MOVES = np.zeros((N_ACTIONS, N_CODES, POSES), int)
+MOVES[LEFT] = (_DIRECTION - 1) % 4 - _DIRECTION
+MOVES[RIGHT] = (_DIRECTION + 1) % 4 - _DIRECTION
+MOVES[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = (AHEAD - _CELL) * 4
+MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), bool)
+MAY_CHANGE[PICKUP, KEY : KEY + 3] = True
+MAY_CHANGE[DROP, EMPTY] = True
+MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
+STRIP = SIZE * TILE * TILE * 3  # bytes of a strip, which is a row of cells in an image
 # The engine's tables that grow. They have a row for each state, or for each configuration.
 PER_STATE = (
     "_site",
@@ -67,6 +84,19 @@ PER_CONFIGURATION = (
 )
 
 Configuration = tuple[int, ...]  # the layout's seed, the door, and the places of the blue, the green and the red key
+
+
+@cache
+def tiles() -> Bytes:
+    """Draw MiniGrid's picture of each cell code, uint8 (N_CODES, 8, 8, 3)."""
+    goal, open_door = Goal(), Door(DOOR_COLOUR, is_open=True)
+    keys = [Key(colour) for colour in KEY_COLOURS]
+    doors = [open_door, Door(DOOR_COLOUR), Door(DOOR_COLOUR, is_locked=True)]
+    objects = [None, Wall(), goal, *keys, *doors]
+    with_agent = product((None, open_door, goal), range(4))
+    table = draw_tiles([*product(objects, [None]), *with_agent])
+    table.flags.writeable = False
+    return table
 
 
 class DoorKeyEngine(Engine):
