@@ -87,7 +87,7 @@ def command_line() -> str:
     from typer.cli import get_docs_for_click
 
     from hypogoal.cli import commands
-    from hypogoal.command.app import app
+    from hypogoal.command.program import app
 
     command: Any = typer.main.get_command(app)
     command.commands = commands()

@@ -20,8 +20,7 @@ from typing import Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from hypogoal.command import call, stage
-from hypogoal.command.app import MAKE, Json, Made, app, command, echo
+from hypogoal.command import call, program, stage
 from hypogoal.core import own_code, processes
 from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
@@ -60,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 @functools.cache
 def _commands() -> Any:
     """Return Typer's commands, built once per process, because building takes longer than many commands."""
-    return typer.main.get_command(app)
+    return typer.main.get_command(program.app)
 
 
 def commands() -> dict[str, Any]:
@@ -107,7 +106,7 @@ def _fail(message: str, code: int, error: BaseException | None = None) -> int:
     return code
 
 
-@command(MAKE, "run doorkey --preset demo --out runs/demo")
+@program.command(program.MAKE, "run doorkey --preset demo --out runs/demo")
 def run(
     experiment: Annotated[str, Argument(help=EXPERIMENTS)],
     out: Annotated[Path | None, Option(help="The folder to write. Default: runs/EXPERIMENT.")] = None,
@@ -166,25 +165,25 @@ def run(
     say(*look.outcome(evaluation), out / "report" / "index.html")
 
 
-@command(stage.LOOK, "show runs/mine")
+@program.command(stage.LOOK, "show runs/mine")
 def show(
-    path: Made,
-    as_json: Json = False,
+    path: program.Made,
+    as_json: program.Json = False,
     pictures: Annotated[Path | None, Option(help="Draw labelled states of a data file into this folder.")] = None,
 ) -> None:
     """Say what a file or folder is, what came out, and how it was made."""
     from hypogoal import look
 
     details = look.describe(path)
-    echo(details, as_json, [*look.outcome(details), *look.lines(details)] or look.in_the_making(path))
+    program.echo(details, as_json, [*look.outcome(details), *look.lines(details)] or look.in_the_making(path))
     if pictures is not None:
         from hypogoal.tools.sheets import write_sheets
 
         say(*write_sheets(path, pictures), err=as_json)
 
 
-@command(stage.LOOK, "verify runs/mine")
-def verify(path: Made, as_json: Json = False) -> None:
+@program.command(stage.LOOK, "verify runs/mine")
+def verify(path: program.Made, as_json: program.Json = False) -> None:
     """Check for missing or changed files. The exit code is 2 if there are any.
 
     It reads every file, and the inputs that lie within PATH. It names outputs
@@ -198,22 +197,22 @@ def verify(path: Made, as_json: Json = False) -> None:
     if not look.parts_of(path):
         state = "nothing is complete yet"
     lines = faults or [f"{path}: {state}"]
-    echo({"path": str(path), "faults": faults, "notes": notes}, as_json, lines + notes)
+    program.echo({"path": str(path), "faults": faults, "notes": notes}, as_json, lines + notes)
     if faults:
         raise typer.Exit(2)
 
 
-@command(stage.LOOK, "status runs/mine")
-def status(path: Annotated[Path, Argument(help="A run.")], as_json: Json = False) -> None:
+@program.command(stage.LOOK, "status runs/mine")
+def status(path: Annotated[Path, Argument(help="A run.")], as_json: program.Json = False) -> None:
     """Say which outputs are out of date or unfinished, why, and how to renew them."""
     from hypogoal import look
 
     notes = look.in_the_making(path)
     rows = look.stale(path)
-    echo(rows, as_json, [*notes, *look.stale_lines(rows)])
+    program.echo(rows, as_json, [*notes, *look.stale_lines(rows)])
 
 
-@command(stage.LOOK, "config train-ensemble --domain montezuma")
+@program.command(stage.LOOK, "config train-ensemble --domain montezuma")
 def config(
     stage: Annotated[str, Argument(help="A command that has settings, such as train-meta or run.")],
     domain: Annotated[str, Option(help=f"The domain whose defaults to show: {call.DOMAINS}")] = "doorkey",
@@ -221,7 +220,7 @@ def config(
     toml: Annotated[
         bool, Option("--toml", metavar="", help="Print a .toml file, which you can edit and give to --preset.")
     ] = False,
-    as_json: Json = False,
+    as_json: program.Json = False,
 ) -> None:
     """List every setting of a stage, with default, unit, meaning and source."""
     from hypogoal.core import presets
@@ -229,7 +228,7 @@ def config(
     from hypogoal.experiments.experiment import config_class_of
 
     rows = presets.described(config_class_of(stage, domain), *domains.layers_of(stage, domain, preset))
-    echo(rows, as_json, [presets.as_toml(stage, rows)] if toml else _setting_lines(rows))
+    program.echo(rows, as_json, [presets.as_toml(stage, rows)] if toml else _setting_lines(rows))
 
 
 def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
@@ -249,10 +248,11 @@ def _setting_lines(rows: Iterable[Mapping[str, Any]]) -> Iterable[str]:
 
 
 for _stage, _help in stage.LISTED.items():  # for --help alone; the commands are made when they are called
-    app.command(_stage, help=_help, rich_help_panel=stage.TOOLS.get(_stage, MAKE))(lambda: None)
+    _panel = stage.TOOLS.get(_stage, program.MAKE)
+    program.app.command(_stage, help=_help, rich_help_panel=_panel)(lambda: None)
 
 
-@command(stage.OWN, "check mine:DOMAIN")
+@program.command(stage.OWN, "check mine:DOMAIN")
 def check(
     domain: Annotated[str | None, Argument(help=f"{call.DOMAINS[:-1]}; or a data file, FILE.h5.")] = None,
     diversity: Annotated[str | None, Option(help="A diversity objective: a name or module:function.")] = None,

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from hypogoal.core import hdf5
 from hypogoal.core.arrays import Array, Bools, Ints
 from hypogoal.core.artefacts import versions
 from hypogoal.core.errors import UserError
-from hypogoal.core.hdf5 import RECOLLECT, create_hdf5, fixed, opened, plain, store, whole
 from hypogoal.label_checks import require_names
 from hypogoal.observations import (
     NUMBERS,
@@ -134,15 +134,15 @@ def write_dataset(
     }
     if collected.channels:
         attributes["channels"] = json.dumps(dict(collected.channels))
-    with create_hdf5(path) as file:
+    with hdf5.create_hdf5(path) as file:
         for name, value in attributes.items():
-            stored = fixed(value) if isinstance(value, str) else value
+            stored = hdf5.fixed(value) if isinstance(value, str) else value
             file.attrs[name] = stored
         _write_split(file, "labelled", collected.labelled, collected.sub_goals)
         _write_split(file, "heldout", collected.heldout, collected.sub_goals)
         _write_states(file.create_group("unlabelled"), collected.unlabelled)
         if collected.features:  # a dataset, because they may exceed an attribute's size
-            file["features"] = fixed(json.dumps(collected.features))
+            file["features"] = hdf5.fixed(json.dumps(collected.features))
         file.attrs.modify("complete", True)
 
 
@@ -172,7 +172,7 @@ def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]
         for name in ("observations", "origin"):  # in this order, whatever the hashes of this process
             if name in first and name not in group:
                 group[name] = first[name]
-        store(group, "labels", column)
+        hdf5.store(group, "labels", column)
 
 
 def _write_states(group: Any, states: States) -> None:
@@ -180,9 +180,9 @@ def _write_states(group: Any, states: States) -> None:
     if not finite.all():
         fault = "the domain's observations have numbers that are not finite"
         raise UserError(fault, f"{group.name}, state {finite.argmin()}", "Clip or replace them.")
-    store(group, "observations", states.observations)
+    hdf5.store(group, "observations", states.observations)
     for name, values in states.origins.items():
-        store(group, f"origin/{name}", values)
+        hdf5.store(group, f"origin/{name}", values)
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ class Dataset:
         If the file has no names, they are ``x[0]``, ``x[1]``, ... For a mixed observation they are ``key[0]``,
         ``key[1]``, ..., but a picture or a single number has its key alone.
         """
-        with opened(self.path) as file:
+        with hdf5.opened(self.path) as file:
             if "features" in file:
                 return [*json.loads(file["features"][()])]
         names = []
@@ -242,7 +242,7 @@ class Dataset:
 
     def counts(self) -> dict[str, Any]:
         """Count the states of each set, and the positives among them by sub-goal, without reading the observations."""
-        with opened(self.path) as file:
+        with hdf5.opened(self.path) as file:
             counts: dict[str, Any] = {"unlabelled": len(file["unlabelled/observations"])}
             for split in SPLITS:
                 counts[split] = {}
@@ -262,9 +262,9 @@ class Dataset:
         if sub_goal not in ("", *self.sub_goals):
             goals = ", ".join(self.sub_goals)
             raise UserError("unknown sub-goal", sub_goal, f"{self.path} has {goals}.")
-        with opened(self.path) as file:
+        with hdf5.opened(self.path) as file:
             group = file[f"{split}/{sub_goal}"]
-            data = whole(group["observations"])
+            data = hdf5.whole(group["observations"])
             has_shape = data.shape[1:] == self.observation_shape
             if not has_shape or data.dtype != self.observation_dtype:
                 raise ValueError(f"{data.name} is {data.dtype} {data.shape}")
@@ -285,7 +285,7 @@ class Dataset:
 
 def _column(group: Any, name: str) -> Array:
     """Return the values of a dataset that has one value for each state of a group, (N,)."""
-    values, states = whole(group[name])[()], len(group["observations"])
+    values, states = hdf5.whole(group[name])[()], len(group["observations"])
     if values.shape != (states,):
         raise ValueError(f"{group.name}/{name} of shape {values.shape} for {states} states")
     return values
@@ -293,16 +293,16 @@ def _column(group: Any, name: str) -> Array:
 
 def open_dataset(path: Path) -> Dataset:
     """Open a data file that ``collect`` wrote, or the user in the same schema. Raises ``UserError`` for other files."""
-    with opened(path) as file:
-        attributes = {name: plain(value) for name, value in file.attrs.items()}
+    with hdf5.opened(path) as file:
+        attributes = {name: hdf5.plain(value) for name, value in file.attrs.items()}
         version = attributes.get("format")
         if not isinstance(version, int):
             raise UserError("not a hypogoal data file", path, "'hypogoal collect' and 'hypogoal import' make one.")
         if version != DATA_FORMAT:
-            do = RECOLLECT if version < DATA_FORMAT else "Upgrade hypogoal."
+            do = hdf5.RECOLLECT if version < DATA_FORMAT else "Upgrade hypogoal."
             raise UserError(f"the data file has format {version}, this hypogoal reads {DATA_FORMAT}", path, do)
         if not attributes["complete"]:
-            raise UserError("the data file is not complete", path, RECOLLECT)
+            raise UserError("the data file is not complete", path, hdf5.RECOLLECT)
         dataset = Dataset(
             path=path,
             domain=attributes["domain"],

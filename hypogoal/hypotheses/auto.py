@@ -4,7 +4,7 @@ A weight that is too small leaves the members alike, and a weight that is too la
 Both faults show without any labels from other places. So a quarter of the labels is held out. Members are first trained
 without diversity, then with each of ``WEIGHTS`` from the largest down. The search ends at the first weight at which
 every member is as right about the held-out labels as members without diversity, within a standard error, see
-:mod:`hypogoal.hypotheses.weights`. A member that predicts one class for all unlabelled states is no hypothesis. So a
+:mod:`hypogoal.hypotheses.weighing`. A member that predicts one class for all unlabelled states is no hypothesis. So a
 weight that makes a member constant is passed over, unless members without diversity are constant, too.
 
 If the labelled place can be told from other places, members can keep all labels at any weight: the members then agree
@@ -16,7 +16,7 @@ That is at most 1/2 if neither rule says yes to more than half of the states.
 The first member of a sequential ensemble is trained on the labels alone, once for all weights. If the first member
 mixes features, later members can only mix what is left. So ``restarts`` first members begin training. After the share
 ``EARLY`` of the steps, only the member whose predictions tell most about unlabelled states goes on, see
-:func:`hypogoal.hypotheses.weights.information_of`. Members that are trained at once end in different mixtures. So
+:func:`hypogoal.hypotheses.weighing.information_of`. Members that are trained at once end in different mixtures. So
 ``restarts`` whole ensembles are trained, and the ensemble that tells most is kept.
 """
 
@@ -34,13 +34,12 @@ from hypogoal.core.arrays import Bools
 from hypogoal.core.checkpoints import State
 from hypogoal.data import GROUP, States
 from hypogoal.diversity import load_objective
-from hypogoal.hypotheses import scores
+from hypogoal.hypotheses import scores, weighing
 from hypogoal.hypotheses.config import AUTO, LABELS, TrainEnsembleConfig
 from hypogoal.hypotheses.ensemble import THRESHOLD, Ensemble
 from hypogoal.hypotheses.fit import Losses
 from hypogoal.hypotheses.training import EnsembleTraining, require_unlabelled
 from hypogoal.hypotheses.views import StateOrigins
-from hypogoal.hypotheses.weights import WEIGHTS, Tried, accuracies_of, held_out, information_of, lowest_kept
 from hypogoal.observations import Observations
 
 HALF = 0.5
@@ -102,17 +101,17 @@ class AutoTraining:
         self.searches = acts and config.diversity_weight == AUTO
         self.weight = config.diversity_weight if config.diversity_weight != AUTO else 0.0
         self.share = config.share if config.share != AUTO else LABELS
-        self.tried: list[Tried] = []
+        self.tried: list[weighing.Tried] = []
         self.lowest = 0.0
         self.folds: list[Bools] = []
         self.remark = ""
         if self.searches:
-            self.folds, self.remark = held_out(labels, self.origins.labelled.get(GROUP), seed)
+            self.folds, self.remark = weighing.held_out(labels, self.origins.labelled.get(GROUP), seed)
         one_by_one = config.schedule == "sequential" and config.members > 1 and not config.teacher
         self.begins_alone = acts and one_by_one and (self.searches or config.restarts > 1)
         self.begins_together = acts and config.schedule == "simultaneous" and config.restarts > 1
         self.early = max(1, round(config.steps * EARLY))
-        self.most = self.cost(len(self.folds), len(WEIGHTS))
+        self.most = self.cost(len(self.folds), len(weighing.WEIGHTS))
 
     @property
     def ensemble(self) -> Ensemble:
@@ -173,23 +172,25 @@ class AutoTraining:
         for fold in self.folds:
             without.append((yield from self._begin(~fold, fold)))
         if not without:
-            return WEIGHTS[-1]
+            return weighing.WEIGHTS[-1]
         labels = np.concatenate([self.labels[fold] for fold in self.folds])
-        self.lowest = lowest_kept(np.concatenate([begun["right"] for begun in without]), labels)
+        self.lowest = weighing.lowest_kept(np.concatenate([begun["right"] for begun in without]), labels)
         was_constant = any(begun["constant"] for begun in without)
         half = HALF + sqrt(HALF**2 / len(self.unlabelled))
-        for weight in WEIGHTS:
+        for weight in weighing.WEIGHTS:
             outcomes = []
             for fold, begun in zip(self.folds, without, strict=True):
                 outcomes.append((yield from self._train(~fold, begun, weight, held=fold)))
             trained = min(outcome["right"].shape[1] for outcome in outcomes)
             right = np.concatenate([outcome["right"][:, :trained] for outcome in outcomes])
-            accuracy = float(accuracies_of(right, labels).min())
+            accuracy = float(weighing.accuracies_of(right, labels).min())
             differs = float(np.mean([outcome["disagreement"] for outcome in outcomes]))
             constant = any(outcome["constant"] for outcome in outcomes) and not was_constant
             contrary = differs > half
             kept = accuracy >= self.lowest and not constant and not contrary
-            self.tried.append(Tried(weight, accuracy, None if isnan(differs) else differs, constant, contrary, kept))
+            self.tried.append(
+                weighing.Tried(weight, accuracy, None if isnan(differs) else differs, constant, contrary, kept)
+            )
             if kept:
                 break
         return weight
@@ -274,7 +275,7 @@ class AutoTraining:
         positive = predictions.mean(axis=0)
         is_first = self.begins_alone and len(now.ensemble) == 1
         return {
-            "information": float(np.mean([information_of(member) for member in probabilities.T])),
+            "information": float(np.mean([weighing.information_of(member) for member in probabilities.T])),
             "training": now.snapshot() if is_candidate else None,
             "first": now.ensemble.networks[0].state_dict() if is_first and not is_candidate else None,
             "positive": float((predictions[:, 0].sum() + 1) / (len(predictions) + 2)),  # neither 0 nor 1
@@ -291,7 +292,7 @@ class AutoTraining:
         """Say whether a member at the end of its training has a lower held-out accuracy than it must keep."""
         if held is None or now.done < self.config.steps or len(self.folds) > 1:
             return False
-        accuracies = accuracies_of(self._right(now, held), self.labels[held])
+        accuracies = weighing.accuracies_of(self._right(now, held), self.labels[held])
         return bool(accuracies.min() < self.lowest)
 
 

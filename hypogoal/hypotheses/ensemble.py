@@ -15,9 +15,8 @@ from torch import Tensor, nn
 from hypogoal.core.arrays import Bools, Floats
 from hypogoal.core.errors import UserError
 from hypogoal.core.tensors import load_fitting, load_tensors, save_tensors
-from hypogoal.hypotheses import deep_lift, networks, patches
+from hypogoal.hypotheses import deep_lift, networks, patches, views
 from hypogoal.hypotheses.thresholds import log_odds_of
-from hypogoal.hypotheses.views import FullView, View, view_of
 from hypogoal.observations import NUMBERS, Observations, Shape, numbers_of, packed, type_of, type_text, values_in
 
 THRESHOLD = 0.5  # the probability above which a prediction is positive, unless another threshold is set
@@ -69,11 +68,11 @@ class Ensemble(nn.Module):
         observation_shape: Shape,
         members: int,
         generator: torch.Generator,
-        view: View | None = None,
+        view: views.View | None = None,
     ):
         super().__init__()
         self.observation_shape = tuple(observation_shape)
-        self.view = view or FullView(self.observation_shape)
+        self.view = view or views.FullView(self.observation_shape)
         shape, dtype = self.view.shape, self.view.dtype
         self.network = networks.network_for(network, shape, dtype)
         built = [networks.build_network(self.network, shape, generator, dtype) for _ in range(members)]
@@ -244,7 +243,7 @@ def together(ensembles: Sequence[Ensemble]) -> Ensemble | None:
     Returns None if any of the ensembles has a view of its own or standardises numbers.
     """
     first = ensembles[0]
-    if any(type(each.view) is not FullView or each.view.standard is not None for each in ensembles):
+    if any(type(each.view) is not views.FullView or each.view.standard is not None for each in ensembles):
         return None
     every = Ensemble(first.network, first.observation_shape, 0, torch.Generator(), first.view)
     for each in ensembles:
@@ -284,7 +283,7 @@ def read_ensemble(
     try:
         shape = tuple(config["observation_shape"])
         dtype = type_of(config["observation_dtype"])
-        view = view_of(config["view"], config.get("view_settings", ()), shape, dtype)
+        view = views.view_of(config["view"], config.get("view_settings", ()), shape, dtype)
         make = partial(Ensemble, config["network"], shape, config["members"], torch.Generator(), view)
         return load_fitting(make, state, str(path)).eval()
     except (RuntimeError, KeyError, IndexError, TypeError, ValueError):

@@ -14,12 +14,12 @@ from test_training import assert_same, follows, toy, toy_states
 import hypogoal
 from hypogoal.core.artefacts import Artefact
 from hypogoal.core.checkpoints import Checkpoints
-from hypogoal.hypotheses import auto
+from hypogoal.hypotheses import weighing
 from hypogoal.hypotheses.auto import AutoTraining
 from hypogoal.hypotheses.config import TrainEnsembleConfig
 from hypogoal.hypotheses.scores import idle_members, mean_disagreement
 from hypogoal.hypotheses.views import StateOrigins
-from hypogoal.hypotheses.weights import WEIGHTS, held_out, information_of, lowest_kept
+from hypogoal.hypotheses.weighing import WEIGHTS, held_out, information_of, lowest_kept
 
 AUTO = TrainEnsembleConfig(members=2, steps=50, learning_rate=1e-3, batch_size=32, restarts=2)
 HALF = np.arange(64) % 2 == 0
@@ -154,7 +154,7 @@ def test_a_weight_that_makes_members_constant_is_passed_over(monkeypatch: pytest
         assert now is not None
         return {**usual(training, *rest), "constant": now.config.diversity_weight == 1e-3}  # type: ignore[arg-type]
 
-    monkeypatch.setattr(auto, "WEIGHTS", (1e-3, 1e-4))
+    monkeypatch.setattr(weighing, "WEIGHTS", (1e-3, 1e-4))
     monkeypatch.setattr(AutoTraining, "_outcome", outcome)
     first, second = trained().tried
     assert (first.constant, first.kept, second.constant, second.kept) == (True, False, False, True)
