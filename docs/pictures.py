@@ -36,7 +36,15 @@ def photograph(page: Path) -> None:
         raw = Path(folder) / "screen.png"
         size = f"--window-size={SCREEN[0]},{SCREEN[1]}"
         profile = f"--user-data-dir={folder}/profile"
-        command = [CHROMIUM, *SWITCHES, profile, size, f"--screenshot={raw}", page.resolve().as_uri()]
+        command = [
+            CHROMIUM,
+            *SWITCHES,
+            "--hide-scrollbars",
+            profile,
+            size,
+            f"--screenshot={raw}",
+            page.resolve().as_uri(),
+        ]
         subprocess.run(command, check=True, capture_output=True, timeout=120)
         screen = Image.open(raw).convert("RGB").quantize(COLOURS)
     text = PngImagePlugin.PngInfo()
