@@ -12,8 +12,8 @@ Choosing: members learn from the plain layout 0 (150 steps); layouts are the fir
 in the way, a seed each; PPO chooses for 50,000 steps, then agent and uniform-random choice play 8,000 steps each.
 
 Commits e4a7b5a (planned), a08a8b0 (learned), a133675 (baselines). Preference: layouts 300 to 333, seeds 3000 to 3033,
-100,000 steps, commit 7f39d96; with learned options Figure 6's agents, layouts 300 to 309 and, of commit 033b90a9, 310 to
-319 with seeds 3010 to 3019: hypogoal run examples.figure6:figure6 --set methods=dbat-k3 --set told= --set baselines=
+100,000 steps, commit 7f39d96; with learned options Figure 6's agents, layouts 300 to 309, and, of commit 033b90a9, 310
+to 319 with seeds 3010 to 3019: hypogoal run examples.figure6:figure6 --set methods=dbat-k3 --set told= --set baselines=
 --set papers= --set layouts=310 --seed 3010. Rooms: commits a2bca61, 36a0e7a (first and second setting).
 """
 
