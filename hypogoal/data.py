@@ -151,12 +151,12 @@ def _require_one_kind(collected: Collected) -> None:
     dtype = collected.unlabelled.observations.dtype
     shape = tuple(collected.observation_shape)
     for name in ("labelled", "unlabelled", "heldout"):
-        given = getattr(collected, name).observations
-        is_alike = given.dtype == dtype and given.shape[1:] == shape
+        observations = getattr(collected, name).observations
+        is_alike = observations.dtype == dtype and observations.shape[1:] == shape
         if not is_alike or not is_stored(dtype):
             fault = f"the domain's {name} observations cannot be stored"
             do = f"Give all sets as uint8, as float32 or as hypogoal.observations.packed makes them, of shape {shape}."
-            raise UserError(fault, f"{given.dtype} {given.shape}", do)
+            raise UserError(fault, f"{observations.dtype} {observations.shape}", do)
 
 
 def _write_split(file: Any, split: str, states: States, sub_goals: Sequence[str]) -> None:
