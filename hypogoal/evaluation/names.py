@@ -35,7 +35,6 @@ RANDOM = "random choice"
 PRETRAINING = "random choice while options learn"
 ORACLE_AGENT = "oracle terminations"
 ORACLE_RANDOM = "oracle terminations, random choice"
-BUILT_IN = ("symbols", "ppo")  # choosers that learn; if a run has both, the setting tells their names apart
 UNIFORM = "uniform-random choice among its own options"
 METHODS = ("D-BAT", "DivDis", "independence", "no diversity", ONE)  # methods of ensembles
 ORDER = (*METHODS, LEARNED, RANDOM, PRETRAINING, ORACLE_AGENT, ORACLE_RANDOM)  # order in tables and figures
@@ -59,7 +58,8 @@ def agent_title(kind: str, config: Values) -> str:
     if config["chooser"] == "random":
         return ORACLE_RANDOM if oracle else RANDOM
     title = ORACLE_AGENT if oracle else LEARNED
-    return title if config["chooser"] in BUILT_IN else f"{title}, chooser={config['chooser']}"
+    is_own = ":" in config["chooser"]
+    return f"{title}, chooser={config['chooser']}" if is_own else title
 
 
 def rank(name: str) -> int:
