@@ -145,8 +145,6 @@ def run(
         return
     if engine == "local" and device == "cuda":  # with Slurm, the device is another machine's
         processes.prepare(device)
-    if engine == "local" and not quiet:
-        say(f"Each line names what one command makes in {out}.", err=True)
     runs.run(
         cells,
         out,

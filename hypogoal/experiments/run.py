@@ -163,6 +163,9 @@ def run_local(cells: Sequence[Cell], *, workers: int, say: Callable[[str], None]
                 ready = [cell for cell in makeable if at_work.isdisjoint(cell.after)]
                 starting = ready[:free]
                 idle_cores = cores() - len(running)
+                is_first = len(todo) == len(cells)
+                if starting and is_first:
+                    say(f"Each line names what one command makes in {cells[0].run}.")
                 for cell in starting:
                     todo.remove(cell)
                     say(f"{cell.name} begins; {_to_come(cells, len(todo), time.monotonic() - begun_at)}")

@@ -60,7 +60,7 @@ def test_any_large_enough_image_fits(name: str, smallest: int) -> None:
     with pytest.raises(UserError, match=line):
         network_of(name, (smallest - 1, smallest, 1))
     page = (Path(__file__).parents[2] / "docs" / "own-domain.md").read_text(encoding="utf-8")
-    assert re.search(rf"`{name}`,? from {smallest}\b", page)
+    assert re.search(rf"`{name}`,?\s+from {smallest}\b", page)
 
 
 @pytest.mark.parametrize(
