@@ -1,8 +1,8 @@
 """Option learning as in the paper: a conv-GRU network and a replay of its own for each member.
 
-A state's *window* is the last ``recurrence`` states of its option's execution, itself the last. The GRU reads a window
-from its first state on, with nothing remembered; so it does in acting, in learning, and in what is loaded. A window of
-1 is a state alone (DEV-16).
+A state's *window* is the last ``recurrence`` states of its option's execution, up to the state itself. The GRU reads a
+window from its first state on, and remembers nothing from before the window: in acting, in learning, and in saved
+options. A window of 1 is a state alone (DEV-16).
 """
 
 from collections import deque
@@ -31,16 +31,16 @@ from hypogoal.options.replay import PrioritisedReplay
 
 @dataclass(frozen=True)
 class Lived(Columns):
-    """Steps of executions, arrays (n, ...)."""
+    """Steps of executions, as arrays (n, ...)."""
 
-    path: NDArray[np.int32]  # (n, recurrence + 1), ids: a window, then the state that came next, then any of these
-    length: Ints  # of the window
+    path: NDArray[np.int32]  # (n, recurrence + 1), state ids: a window, the state after it, then any states of the two
+    length: Ints  # the number of states in the window
     action: Ints
-    terminated: Bools  # the task is over
+    terminated: Bools  # whether the task is over
 
 
 class Member(double_dqn.DoubleDQN):
-    """One member's policy: networks, optimiser, replay, and the steps since its last update."""
+    """One member's policy: networks, optimiser, replay, and the number of steps since its last update."""
 
     CHANGING = (*double_dqn.DoubleDQN.CHANGING, "replay", "due")
     online: PaperQNetwork
@@ -55,24 +55,24 @@ class Member(double_dqn.DoubleDQN):
 
 
 class PaperPolicies:
-    """Greedy policies of saved options that have a network each."""
+    """The greedy policies of saved options, each with a network of its own."""
 
     def __init__(self, options: saved.SavedOptions):
         self.recurrence = options.config["recurrence"]
-        actions = len(options.weights.get("0.values.2.bias", ())) or 1  # any, where weights are missing
+        actions = len(options.weights.get("0.values.2.bias", ())) or 1  # 1 if weights are missing, refused below
         make = partial(PaperQNetwork, options.shape, actions)
         each = [tensors.below(f"{option}.", options.weights) for option in range(options.count)]
         self.networks = [tensors.load_fitting(make, weights, saved.FILE).eval() for weights in each]
 
     def __call__(self, option: int) -> Callable[[Observations], int]:
-        """Start an execution."""
+        """Start an execution of ``option``, and return the function from an observation to an action."""
         window: deque[Observations] = deque(maxlen=self.recurrence)
         return partial(_act, self.networks[option], window)
 
 
 @torch.no_grad()
 def _act(network: PaperQNetwork, window: deque[Observations], observation: Observations) -> int:
-    """The action in the last state of an execution, of which ``window`` has those before."""
+    """Append ``observation`` to the execution's ``window`` and return the greedy action."""
     window.append(observation)
     seen = network.see(torch.from_numpy(np.stack(window)))
     count = len(window)
@@ -81,7 +81,7 @@ def _act(network: PaperQNetwork, window: deque[Observations], observation: Obser
 
 
 class PaperLearner(Learner):
-    """The intra-option policies of all O options, each on its own; arguments as of :class:`Learner`."""
+    """A learner of O options whose policies share nothing. The arguments are those of :class:`Learner`."""
 
     policies = PaperPolicies
     settings: PaperConfig
@@ -89,7 +89,7 @@ class PaperLearner(Learner):
 
     @classmethod
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
-        """It sees pictures only, and learns single steps of its members' own executions."""
+        """Raise ``UserError`` if ``experience`` is not ``own``, or if observations are no pictures."""
         if config.experience != "own":
             fault = "network=paper needs experience=own"
             raise UserError(
@@ -108,16 +108,16 @@ class PaperLearner(Learner):
             with DrawsFrom(torch_generator(seed, "option-weights", option)):
                 network = PaperQNetwork(shape, actions)
             self.members.append(Member(network.to(self.device), settings))
-        self.windows = np.zeros((self.engine.count, settings.recurrence), int)  # of running executions
-        self.lengths = np.zeros(self.engine.count, int)  # theirs; the places behind have states of the window
+        self.windows = np.zeros((self.engine.count, settings.recurrence), int)  # of the executions that run
+        self.lengths = np.zeros(self.engine.count, int)  # of the windows; the places after a window repeat its states
         self._in_pieces = self.engine.tiles is not None and self.device.type == "cpu"
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
-        """How many states back the replays hold when each has had as many steps as another.
+        """Return how many states back the replays look if all members have had equally many steps.
 
-        Of what a member that had fewer has stored, the oldest may be forgotten nevertheless; it is left out of its
-        batches.
+        If a member has had fewer steps, the engine may have forgotten states in its replay. Steps with forgotten states
+        are left out of batches.
         """
         settings = config.part(PaperConfig)
         return options * settings.replay + (settings.recurrence + STACK) * config.environments
@@ -129,7 +129,10 @@ class PaperLearner(Learner):
         options: Ints,
         age: Ints,
     ) -> Ints:
-        """As of :class:`Learner`, called once a step; BatchNorm is in evaluation mode."""
+        """Return the greedy actions, as :meth:`Learner.greedy` does, with BatchNorm in evaluation mode.
+
+        Call this once a step, because each call appends ``ids`` to the windows.
+        """
         windows = self.windows
         begun, full = age == 0, age >= self.settings.recurrence
         windows[begun] = ids[begun, None]
@@ -148,7 +151,7 @@ class PaperLearner(Learner):
         return chosen
 
     def _seen(self, windows: Ints) -> tuple[Observations, Tensor]:
-        """The distinct images in windows, and which one each place has."""
+        """Return the distinct images in windows, and the index of each place's image, in the shape of ``windows``."""
         states, places = np.unique(windows, return_inverse=True)
         return self.engine.images(states), tensor(places.reshape(windows.shape), self.device)
 
@@ -165,7 +168,7 @@ class PaperLearner(Learner):
         self.count(moved.options)
 
     def learn(self) -> dict[str, float]:
-        """The updates that are due (Tables 2, 4: one per 4 steps of the member)."""
+        """Make the updates that are due. In Tables 2 and 4, one update is due per 4 steps of the member."""
         last = None
         for option, member in enumerate(self.members):
             if member.replay.size < min(self.settings.warm_up, self.settings.replay):
@@ -176,7 +179,7 @@ class PaperLearner(Learner):
         return self.health(last, sum(member.replay.size for member in self.members)) if last else {}
 
     def _update(self, option: int, member: Member) -> double_dqn.Updated | None:
-        """One update of a member's policy; None where all steps drawn are forgotten."""
+        """Update a member's policy once. Return None, without an update, if all the steps drawn are forgotten."""
         indices, weights = member.replay.sample(self.settings.option_batch, self.rng)
         steps = member.replay.data.at(indices)
         kept = self.engine.remembers(steps.path).all(axis=1)
@@ -191,7 +194,7 @@ class PaperLearner(Learner):
         lengths = tensor(length, self.device)
         later_lengths = tensor(np.minimum(length + 1, most), self.device)
         both = np.stack([now, following])
-        images, (before, after) = self._seen(both)  # each image once; BatchNorm counts it once (DEV-51)
+        images, (before, after) = self._seen(both)  # each image once, so BatchNorm counts an image once (DEV-51)
         online, target = member.online.train(), member.target
         shown = online.pieces_of(images) if self._in_pieces else tensor(images, self.device)
         seen = online.see(shown)

@@ -19,7 +19,7 @@ from hypogoal.core.errors import NumericalError
 from hypogoal.core.tensors import load_into
 from hypogoal.options.config import LearnerConfig
 
-SOFT = 0.01  # how far a target network follows at an update where it is not copied now and then
+SOFT = 0.01  # the share by which a target network follows at each update, if ``target_interval`` is 0
 
 
 def double_q_targets(
@@ -58,19 +58,19 @@ class ReplayBatch:
     """Transitions that the policies of O options learn from."""
 
     actions: Ints  # (n,)
-    steps: Ints  # (n,), on which the next state is
-    reached: Bools  # (n, O), the option's sub-goal holds in the next state
-    terminated: Bools  # (n,), the task is over there
+    steps: Ints  # (n,), the number of steps from the state to the next state
+    reached: Bools  # (n, O), whether the option's sub-goal holds in the next state
+    terminated: Bools  # (n,), whether the task is over in the next state
     learns: Bools  # (n, O), which policies learn from which transitions
-    weights: Floats  # (n,)
+    weights: Floats  # (n,), the importance weights
 
 
 class Updated(NamedTuple):
-    """What one update found."""
+    """The numbers of one update."""
 
     loss: float
     q: float  # the mean value of the actions taken
-    errors: Floats  # each transition's largest absolute TD error, (n,)
+    errors: Floats  # (n,), each transition's largest absolute TD error
 
 
 class DoubleDQN(Resumable):
@@ -86,7 +86,7 @@ class DoubleDQN(Resumable):
         self.target = copy.deepcopy(online).requires_grad_(False).eval()
         self.optimiser = Adam(online.parameters(), config.option_learning_rate)
         self.updates = 0
-        # What is updated in place, read once: it takes as long to gather as to change.
+        # The pairs of tensors are gathered once, because gathering takes as long as updating in place.
         self._followed = [*zip(self.target.state_dict().values(), online.state_dict().values(), strict=True)]
 
     def update(
@@ -98,10 +98,11 @@ class DoubleDQN(Resumable):
         options: Sequence[int],
         step: int,
     ) -> Updated:
-        """A step down the Huber loss of a batch; then the target network follows.
+        """Take a step down the Huber loss of a batch, then let the target network follow.
 
-        ``values`` are the online network's in the states, with gradients; ``next_online`` and ``next_target`` both
-        networks' in the next states; all float (n, O, A). ``options`` (O,) and ``step`` are for errors.
+        ``values`` are the online network's values in the states, with gradients. ``next_online`` and ``next_target``
+        are the two networks' values in the next states. All are float (n, O, A). Error messages name ``options`` (O,)
+        and ``step``.
         """
         actions, steps, reached, terminated, learns, weights = (
             tensor(array, values.device) for array in vars(batch).values()
@@ -127,7 +128,7 @@ class DoubleDQN(Resumable):
 
     @torch.no_grad()
     def _follow(self) -> None:
-        """Copy the online network every ``target_interval`` updates; where that is 0, move a little towards it."""
+        """Copy the online network every ``target_interval`` updates. If that is 0, move towards it each time."""
         interval = self.config.target_interval
         if interval and self.updates % interval:
             return
@@ -138,7 +139,7 @@ class DoubleDQN(Resumable):
                 ours.lerp_(theirs, SOFT)
 
     def load(self, weights: Mapping[str, Tensor], where: str) -> None:
-        """Go on with these weights; a ``UserError`` that says ``where`` if they do not fit."""
+        """Go on with ``weights``. Raises ``UserError``, which names ``where``, if the weights do not fit."""
         load_into(self.online, weights, where)
         self.target.load_state_dict(weights)
 
@@ -150,9 +151,10 @@ def descend(
     where: str,
     largest: float = math.inf,
 ) -> None:
-    """A step of ``optimiser`` down a loss, with its weights' gradients cut to the norm ``largest``.
+    """Take a step of ``optimiser`` down a loss, with gradients cut to the norm ``largest``.
 
-    A loss or gradient with NaN or Inf is a ``NumericalError`` that names ``owner`` and ``where``; the weights stay.
+    Raises ``NumericalError``, which names ``owner`` and ``where``, if the loss or a gradient is NaN or infinite. The
+    weights stay as they were then.
     """
     if not torch.isfinite(loss):
         raise NumericalError(f"the loss of {owner} is {float(loss.detach())} {where}")
@@ -167,5 +169,8 @@ def descend(
 
 
 def linear_epsilon(steps: int | Ints, over: int, final: float) -> Doubles:
-    """Exploration falling from 1 to ``final`` over ``over`` steps (Tables 2 and 4), of each of ``steps``."""
+    """Return the probability of exploration at ``steps``, which falls from 1 to ``final`` over ``over`` steps.
+
+    Source: Tables 2 and 4.
+    """
     return np.maximum(final, 1.0 - (1.0 - final) * np.asarray(steps) / over)

@@ -25,19 +25,19 @@ MASKED = "a masked option runs: choose by action_masks(), or have warnings of th
 
 @dataclass(frozen=True, repr=False)
 class Options:
-    """G x K options; option g*K + k aims at member k's hypothesis of sub-goal g.
+    """G x K options. Option g*K + k aims at member k's hypothesis of sub-goal g.
 
     Attributes:
-        sub_goals: G names.
-        members: K.
+        sub_goals: the names of the G sub-goals.
+        members: K, the number of members of each ensemble.
         ensembles: the termination classifiers, one ensemble per sub-goal.
-        policies: starts an option's greedy policy, which :class:`OptionEnv` plays to its end.
-        rule: what ends options, as it was when they were saved; each environment plays with a copy.
-        timeout: steps after which an option ends.
-        mask_reached: whether options are withheld where their sub-goals already hold, as in training (D6).
-        domain, domain_config: where they were trained, see :meth:`make_env`.
+        policies: starts an option's greedy policy, which :class:`OptionEnv` plays to the option's end.
+        rule: what ends options, as the rule was when the options were saved. Each environment plays with a copy.
+        timeout: the number of steps after which an option ends.
+        mask_reached: whether options are withheld where their sub-goals already hold, as in training.
+        domain, domain_config: where the options were trained, see :meth:`make_env`.
 
-    It can be sent to another process.
+    Options can be sent to another process.
     """
 
     sub_goals: tuple[str, ...]
@@ -56,11 +56,11 @@ class Options:
 
     @property
     def count(self) -> int:
-        """G * K."""
+        """The number of options, G * K."""
         return len(self.sub_goals) * self.members
 
     def make_env(self, **arguments: Any) -> Env:
-        """The Gymnasium environment they were trained in, with the settings its states were collected with.
+        """Return the Gymnasium environment of training, with the settings with which its states were collected.
 
         ``arguments`` go to the environment, for example ``layout_seed``. Raises ``UserError`` if the domain is not
         installed, is code that the user did not allow, or has no environment.
@@ -69,16 +69,16 @@ class Options:
         return domain.make_env(**domain.world(self.domain_config) | arguments)
 
     def name(self, option: int) -> str:
-        """For example ``open-red-door/2``."""
+        """Return an option's name, for example ``open-red-door/2``."""
         return f"{self.sub_goals[option // self.members]}/{option % self.members}"
 
     def log_odds(self, option: int, observation: Observations) -> Floats:
-        """How sure one option's member is of its sub-goal in an observation (*obs): float32 (1,)."""
+        """Return how sure an option's member is that its sub-goal holds in ``observation`` (*obs), float32 (1,)."""
         ensemble = self.ensembles[option // self.members]
         return ensemble.log_odds(observation[None])[:, option % self.members]
 
     def offered(self, observation: Observations) -> Bools:
-        """Which options may start in an observation (*obs): bool (G*K,)."""
+        """Return which options may start in ``observation`` (*obs), bool (G*K,)."""
         if not self.mask_reached:
             return np.ones(self.count, bool)
         log_odds = [ensemble.log_odds(observation[None]) for ensemble in self.ensembles]
@@ -88,22 +88,22 @@ class Options:
 class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """A Gymnasium environment whose actions are options: ``Discrete(G*K)``.
 
-    One step runs an option until its rule says so (by default: its classifier is positive), its time is up or the
-    episode ends. The reward is the sum of the rewards inside, discounted by ``gamma``; ``info["duration"]`` is tau, so
-    that an agent can bootstrap with gamma ** tau; ``info["reached"]`` says whether the option's own sub-goal was
-    reached, ``info["option"]`` its name.
+    One step runs an option until its rule ends it (by default: until its classifier is positive), its time is up or the
+    episode ends. The reward is the sum of the rewards inside, discounted by ``gamma``. ``info["duration"]`` is tau, so
+    that an agent can bootstrap with gamma ** tau. ``info["reached"]`` says whether the option's own sub-goal was
+    reached, and ``info["option"]`` is the option's name.
 
-    sb3-contrib's MaskablePPO calls ``action_masks()``; for a ``gymnasium.vector.SyncVectorEnv``, use
-    ``envs.call("action_masks")``. A masked option runs all the same, for agents without masks, with a ``UserWarning``
-    before anything is played; ``info["masked"]`` says so.
+    sb3-contrib's MaskablePPO calls ``action_masks()``. For a ``gymnasium.vector.SyncVectorEnv``, use
+    ``envs.call("action_masks")``. For agents without masks, a masked option runs all the same, with a ``UserWarning``
+    before anything is played, and ``info["masked"]`` is true.
 
     Args:
         env: an environment with the observations that the options were trained on.
-        options: from :func:`hypogoal.load_options`.
-        gamma: discount per environment step inside an option; 1 for the plain sum.
+        options: the options, from :func:`hypogoal.load_options`.
+        gamma: the discount per environment step inside an option. With 1, the reward is the plain sum.
 
     Raises:
-        UserError: the environment has other observations.
+        UserError: if the environment has other observations.
 
     >>> import gymnasium, hypogoal
     >>> options = hypogoal.load_options("runs/demo/meta")
@@ -131,26 +131,26 @@ class OptionEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._look = require_observations(env, options.ensembles[0])
         self.action_space = gymnasium.spaces.Discrete(options.count)
         self._image: Observations | None = None
-        self._masks: Bools | None = None  # of the current observation, once they were asked for
+        self._masks: Bools | None = None  # of the current observation, None until they are asked for
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Like the environment's own."""
+        """Reset the environment."""
         observation, info = self.env.reset(**kwargs)
         self._image, self._masks = self._look.read(observation), None
         self.rule.begin_episodes(np.zeros(1, int))
         return observation, info
 
     def action_masks(self) -> Bools:
-        """Which options may start here, bool (G*K,)."""
+        """Return which options may start in the current observation, bool (G*K,)."""
         if self._masks is None:
             self._masks = self.options.offered(self._current())
         return self._masks.copy()
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Run option ``action`` to its end, though it be masked.
+        """Run option ``action`` to its end, even if the option is masked.
 
         Raises:
-            UserError: there is no such option, or the environment was not reset.
+            UserError: if there is no such option, or if the environment was not reset.
         """
         options = self.options
         if not self.action_space.contains(action):

@@ -1,8 +1,9 @@
 """Light option learning: one trunk, a head per member, every step a lesson for every member.
 
-Double DQN with prioritised replay over state ids. With ``experience=shared`` every member learns from each transition,
-with its own reward, unless the transition starts inside its sub-goal. With ``experience=own`` (the paper) only the
-member whose option was running learns, and a transition may reach several steps ahead within its execution.
+The method is Double DQN with prioritised replay over state ids. With ``experience=shared``, every member learns from
+each transition, with its own reward, unless the transition starts inside its sub-goal. With ``experience=own`` (the
+paper), only the member whose option was running learns, and a transition may reach several steps ahead within its
+execution.
 """
 
 from collections.abc import Mapping
@@ -23,21 +24,21 @@ from hypogoal.options.config import STACK, LightConfig, OptionConfig
 from hypogoal.options.learner import Learner, Transitions
 from hypogoal.options.replay import PrioritisedReplay, Steps, StepsAhead
 
-POSITIVES_KEPT = 512  # per member
-POSITIVE_SHARE = 0.25  # of a batch: steps that reached a sub-goal
+POSITIVES_KEPT = 512  # the number of steps kept that reached a member's sub-goal
+POSITIVE_SHARE = 0.25  # the share of a batch that is drawn from the steps that reached a sub-goal
 GRADIENT_NORM = 10.0
 
 
 @dataclass(frozen=True)
 class Lessons(Steps):
-    """Transitions to learn from, arrays (n,)."""
+    """Transitions to learn from, as arrays (n,)."""
 
-    option: Ints  # that was running
-    terminated: Bools  # the task is over
+    option: Ints  # the option that was running
+    terminated: Bools  # whether the task is over
 
 
 class LightLearner(Learner):
-    """The intra-option policies of all O options, acting and learning together; arguments as of :class:`Learner`."""
+    """A learner of O options whose policies share a network. The arguments are those of :class:`Learner`."""
 
     policies = saved.LightPolicies
     settings: LightConfig
@@ -45,7 +46,10 @@ class LightLearner(Learner):
 
     @classmethod
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
-        """Other members' sub-goals may lie between the first and the last of several steps."""
+        """Raise ``UserError`` if ``n_step`` is above 1 and ``experience`` is not ``own``.
+
+        Other members' sub-goals may lie between the first and the last of several steps.
+        """
         steps = config.part(LightConfig).n_step
         if steps > 1 and config.experience != "own":
             raise UserError(
@@ -64,7 +68,7 @@ class LightLearner(Learner):
         self.steps = self.due = 0
 
     def network(self, settings: LightConfig, seed: int) -> networks.LightQNetwork:
-        """One with fresh weights."""
+        """Return a network with fresh weights."""
         engine = self.engine
         with DrawsFrom(torch_generator(seed, "option-weights")):
             network = networks.LightQNetwork(
@@ -78,7 +82,10 @@ class LightLearner(Learner):
 
     @staticmethod
     def reach(config: OptionConfig, options: int) -> int:
-        """A transition waits n steps, and its turn in the ring n more."""
+        """Return how many states back the learner looks.
+
+        A transition waits n steps to be complete, and up to n more for its turn in the ring.
+        """
         settings = config.part(LightConfig)
         return settings.replay + (2 * settings.n_step + STACK) * config.environments
 
@@ -114,9 +121,10 @@ class LightLearner(Learner):
         self.due += count
 
     def _judged(self, rows: Lessons) -> tuple[Bools, Bools]:
-        """Which options learn from transitions, and which sub-goals hold where these lead to, bool (m, O) each.
+        """Return which options learn from each transition and which sub-goals hold in its next state, bool (m, O) each.
 
-        None learns from a state inside its sub-goal. With own experience both are of the option that was running alone.
+        No option learns from a state inside its sub-goal. With ``experience=own``, both arrays are False for options
+        that were not running.
         """
         if not self.running_only:
             return ~self.terminations.of(rows.state), self.terminations.of(rows.next_state)
@@ -126,7 +134,7 @@ class LightLearner(Learner):
         return owner & ~inside[:, None], owner & reached[:, None]
 
     def learn(self) -> dict[str, float]:
-        if self.steps < self.settings.warm_up or not self.replay.size:  # n-step transitions wait before they are in it
+        if self.steps < self.settings.warm_up or not self.replay.size:  # n-step transitions enter the replay late
             self.due = 0
         last = None
         while self.due >= self.settings.update_interval:
@@ -135,7 +143,7 @@ class LightLearner(Learner):
         return self.health(last, self.replay.size) if last else {}
 
     def _update(self) -> double_dqn.Updated:
-        """One update of all policies."""
+        """Update all policies once."""
         lessons, indices, weights = self._batch()
         learns, reached = self._judged(lessons)
         batch = double_dqn.ReplayBatch(
@@ -164,7 +172,10 @@ class LightLearner(Learner):
         return updated
 
     def _batch(self) -> tuple[Lessons, Ints, Floats]:
-        """Transitions, the first of them drawn from the replay at indices int64 (m,), and weights float32 (n,)."""
+        """Draw n transitions. Return the transitions, indices, int64 (m,), and weights, float32 (n,).
+
+        The first m transitions are drawn from the replay, at the indices.
+        """
         kept = np.arange(POSITIVES_KEPT) < self.positives[:, None]
         if self.engine.memory is not None:
             kept &= self.engine.remembers(self.positive.state)
@@ -173,14 +184,14 @@ class LightLearner(Learner):
         have = np.flatnonzero(counts)
         size = self.settings.option_batch
         extra = round(size * POSITIVE_SHARE) if len(have) else 0
-        extra = min(extra, size - 1)  # priorities need one drawn by them
+        extra = min(extra, size - 1)  # at least one transition is drawn by priority
         indices, weights = self.replay.sample(size - extra, self.rng)
         batch = self.replay.data.at(indices)
         if extra:
             options = have[self.rng.integers(len(have), size=extra)]
             ranks = (self.rng.random(extra) * counts[options]).astype(int)
             _options, kept_slots = np.nonzero(kept)
-            firsts = counts.cumsum() - counts  # of each option among them
+            firsts = counts.cumsum() - counts  # the index of each option's first kept slot
             slots = kept_slots[firsts[options] + ranks]
             batch = Lessons.joined([batch, self.positive.at((options, slots))])
             weights = np.concatenate([weights, np.ones(extra, np.float32)])

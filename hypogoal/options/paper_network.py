@@ -13,18 +13,18 @@ from torch.nn.functional import linear
 from hypogoal.core.arrays import Bytes
 from hypogoal.hypotheses import patches
 
-OF_IMAGES = "gru.weight_ih_l0"  # what nn.GRU, and files, call the weights that it multiplies images with
+OF_IMAGES = "gru.weight_ih_l0"  # the name in nn.GRU, and in files, of the weights that multiply images
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """Images as distinct pairs of a place and a patch: what a sum over places makes of an image is one over its pairs.
+    """Images as distinct pairs of a place and a patch, so that a sum over an image's places is a sum over its pairs.
 
     Attributes:
-        batch: the images' patches.
+        batch: the patches of the images.
         patch: int64 (P,), the patch of each of P pairs, in the order of their places.
-        counts: of each place, how many pairs have it.
-        among: float32 (N, P), 1 where one of N images has a pair.
+        counts: for each place, the number of pairs that have the place.
+        among: float32 (N, P), 1 where an image has a pair, and 0 elsewhere.
     """
 
     batch: patches.PatchBatch
@@ -34,10 +34,11 @@ class Pieces:
 
 
 class PaperQNetwork(nn.Module):
-    """Two of (convolution, BatchNorm, ReLU, pooling), a GRU, two dense layers.
+    """The paper's network: convolution, BatchNorm, ReLU and pooling, twice, then a GRU and two dense layers.
 
-    The paper gives no sizes. Channels 16 and 32 with kernel 3 and GRU 512 are those of the authors' public code
-    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU stands behind pooling: the same function, cheaper.
+    The paper gives no sizes. 16 and 32 channels, kernels of 3 and a GRU of 512 units are in the authors' public code
+    (AnitadeMelloKoch/portable_options, ``cnn_q_function.py``). ReLU comes after pooling, because that computes the same
+    function at less cost.
     """
 
     HIDDEN = 512
@@ -58,7 +59,7 @@ class PaperQNetwork(nn.Module):
         )
         places = math.prod(((side - 2) // 2 - 2) // 2 for side in (height, width))
         weights = dict(nn.GRU(self.CHANNELS * places, self.HIDDEN).named_parameters())
-        # Place by place: in nn.GRU's order every product with the weights of a place would copy them.
+        # Weights are kept place by place. In nn.GRU's order, every product with a place's weights would copy them.
         self.looks = nn.Parameter(by_place(weights.pop("weight_ih_l0").detach(), self.CHANNELS).contiguous())
         self.gru = nn.ParameterDict(weights)
         self.values = nn.Sequential(
@@ -69,9 +70,10 @@ class PaperQNetwork(nn.Module):
         self.register_load_state_dict_pre_hook(_take_those_of_a_file)
 
     def see(self, images: Tensor | Pieces) -> Tensor:
-        """uint8 (N, H, W, C), or their pieces -> what the GRU's gates take from each, float32 (N, 3 * ``HIDDEN``).
+        """Return what the GRU's gates take from each image, float32 (N, 3 * ``HIDDEN``).
 
-        Nearly all of the arithmetic: so an image of many windows is looked at once, which ``nn.GRU`` cannot do.
+        ``images`` are uint8 (N, H, W, C), or their pieces. This is nearly all of the arithmetic. It is done once for an
+        image that is in many windows, which ``nn.GRU`` cannot do.
         """
         bias = self.gru["bias_ih_l0"]
         if isinstance(images, Pieces):
@@ -84,7 +86,7 @@ class PaperQNetwork(nn.Module):
         return torch.addmm(bias, placed, self.looks.flatten(0, 1))
 
     def pieces_of(self, images: Bytes) -> Pieces:
-        """Those of images uint8 (N, H, W, C) that repeat a few tiles: :meth:`see` computes each piece once."""
+        """Return the pieces of images uint8 (N, H, W, C) that repeat a few tiles. :meth:`see` computes a piece once."""
         windows = patches.windows_of(self.features)
         assert windows
         batch = patches.take(patches.tables_of(images, windows), np.arange(len(images)))
@@ -100,10 +102,10 @@ class PaperQNetwork(nn.Module):
         windows: Tensor,
         lengths: Tensor,
     ) -> Tensor:
-        """Values float32 (n, A) of the last states of windows.
+        """Return the values, float32 (n, A), in the last states of windows.
 
-        ``windows`` int64 (n, T) say which of the images :meth:`see` saw each window has; of its T places the first
-        ``lengths`` (n,) are real.
+        ``seen`` is what :meth:`see` returned. ``windows``, int64 (n, T), are the indices of each window's images there.
+        Only the first ``lengths`` (n,) of a window's T places are real.
         """
         state = seen.new_zeros(len(windows), self.HIDDEN)
         for place, images in enumerate(windows.unbind(1)):
@@ -113,7 +115,7 @@ class PaperQNetwork(nn.Module):
         return self.values(state)
 
     def _next(self, seen: Tensor, state: Tensor) -> Tensor:
-        """The GRU's state (n, ``HIDDEN``) after one more image, by the equations of ``nn.GRU``."""
+        """Return the GRU's state (n, ``HIDDEN``) after one more image, by the equations of ``nn.GRU``."""
         remembered = linear(state, self.gru["weight_hh_l0"], self.gru["bias_hh_l0"])
         reset_of_image, update_of_image, new_of_image = seen.chunk(3, dim=1)
         reset_of_state, update_of_state, new_of_state = remembered.chunk(3, dim=1)
@@ -123,18 +125,18 @@ class PaperQNetwork(nn.Module):
         return torch.lerp(new, state, update)
 
     def tensors(self) -> dict[str, Tensor]:
-        """All weights, by the names and in the order of ``nn.GRU``, as files have them."""
+        """Return all weights, by the names and in the order of ``nn.GRU``, as files have them."""
         tensors = self.state_dict()
         looks = tensors.pop("looks")
         return {**tensors, OF_IMAGES: looks.permute(2, 1, 0).flatten(1)}
 
 
 def by_place(weight: Tensor, channels: int) -> Tensor:
-    """Weights of ``nn.GRU``, (3 * hidden, channels * places) -> (places, channels, 3 * hidden)."""
+    """Reorder weights of ``nn.GRU``, (3 * hidden, channels * places), to (places, channels, 3 * hidden)."""
     return weight.unflatten(1, (channels, -1)).permute(2, 1, 0)
 
 
 def _take_those_of_a_file(network: PaperQNetwork, weights: MutableMapping[str, Any], *_of: object) -> None:
-    """Before weights are loaded: those in a file's order are put in the network's."""
+    """Put weights that are in a file's order into the network's order, before the network loads them."""
     if OF_IMAGES in weights:
         weights["looks"] = by_place(weights.pop(OF_IMAGES), network.CHANNELS)

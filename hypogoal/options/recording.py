@@ -17,28 +17,28 @@ from hypogoal.domains.episodes import LAST, EpisodeRecorder
 from hypogoal.options.choosers import Outcome
 from hypogoal.options.tables import ChoiceCounts, Episodes, Executions, Exploits
 
-STOPS_KEPT = 128  # per option
-WINDOW = 5_000  # steps in which choices are counted together
+STOPS_KEPT = 128  # the number of stops kept of each option
+WINDOW = 5_000  # the number of steps whose choices are counted together
 
 
 class Execution(NamedTuple):
-    """One option from its beginning to its end."""
+    """An execution of an option, from its beginning to its end."""
 
-    step: int  # when it ended
+    step: int  # the number of environment steps when the execution ended
     option: int  # g*K + k
-    duration: int  # its steps
-    reached: bool  # its own classifier ended it
-    inside_at_start: bool  # its own classifier was positive where it began
-    terminated: bool  # it ended in a terminal state of the episode
-    truncated: bool  # it ended because its episode was cut
-    began: int  # the id of the state in which it was chosen
-    states: list[int]  # the ids of those that it came to, the last one that it ended in
+    duration: int  # the number of steps of the execution
+    reached: bool  # whether the option's own classifier ended the execution
+    inside_at_start: bool  # whether that classifier was positive already where the execution began
+    terminated: bool  # whether the execution ended in a terminal state of the episode
+    truncated: bool  # whether the execution ended because its episode was cut
+    began: int  # the id of the state in which the option was chosen
+    states: list[int]  # the ids of the states that followed, up to the state in which the execution ended
 
 
 class Recorder(Resumable):
-    """Counts choices per ``WINDOW`` of steps, lists episodes, keeps the last executions and stops of each of O options.
+    """A recorder of episodes, choices per ``WINDOW`` of steps, and the last executions and stops of each of O options.
 
-    Stops are states, of an engine that forgets these their pictures.
+    A stop is the id of a state. If the engine forgets states, a stop is the state's picture.
     """
 
     CHANGING = ("episodes", "choices", "stops", "executions", "paths", "counts", "counted_from")
@@ -49,27 +49,27 @@ class Recorder(Resumable):
         self.choices: list[tuple[float, ...]] = []
         self.stops = latest(options, STOPS_KEPT)
         self.executions = latest(options, LAST)
-        self.paths: list[list[int]] = [[] for _ in range(engine.count)]  # states that running executions came to
-        self.counts = np.zeros((options, 5))  # in the window: offered, chosen, expected, reached, duration
+        self.paths: list[list[int]] = [[] for _ in range(engine.count)]  # the states so far of the executions that run
+        self.counts = np.zeros((options, 5))  # of the window: offered, chosen, expected, reached, duration
         self.counted_from = 0  # the step at which the window began
 
     @property
     def steps(self) -> int:
-        """Environment steps so far, summed over the environments."""
+        """The number of environment steps so far, summed over the environments."""
         return self.episodes.steps
 
     def start_at(self, steps: int) -> None:
-        """Environment steps spent before (those of ``train-options``) count in every curve."""
+        """Begin every curve at ``steps``, the number of environment steps spent earlier, in ``train-options``."""
         self.episodes.steps = self.counted_from = steps
 
     def see(self, step: Step) -> None:
-        """A step of every environment."""
+        """Record one step of every environment."""
         self.episodes.see(step)
         for path, state in zip(self.paths, step.next_ids.tolist(), strict=True):
             path.append(state)
 
     def chose(self, options: Ints, offered: Bools) -> None:
-        """Decisions: the options chosen (n,) among those offered, bool (n, O)."""
+        """Count n decisions for ``options`` (n,), among the options ``offered``, bool (n, O)."""
         if self.steps - self.counted_from >= WINDOW:
             self.flush()
         self.counts[:, 0] += offered.sum(0)
@@ -82,7 +82,7 @@ class Recorder(Resumable):
         self.counts[:, 2] += shares.sum(0)
 
     def finished(self, outcome: Outcome) -> None:
-        """Executions that ended."""
+        """Record executions that ended."""
         np.add.at(
             self.counts[:, 3],
             outcome.options,
@@ -116,7 +116,10 @@ class Recorder(Resumable):
             self.stops[run.option].append(stop)
 
     def recent(self, *, restarted: bool) -> dict[str, float]:
-        """Numbers to show, none before the first episode: of the last episodes or, ``restarted``, of executions."""
+        """Return numbers to show of the last episodes or, with ``restarted``, of the last executions.
+
+        The result is an empty dictionary while none has ended.
+        """
         if not restarted:
             return self.episodes.recent() if self.episodes.rows else {}
         numbers = {}
@@ -126,7 +129,7 @@ class Recorder(Resumable):
         return numbers
 
     def _executions(self) -> list[Execution]:
-        """The last of all options, option by option."""
+        """Return the last executions of all options, option by option."""
         return [*chain(*self.executions)]
 
     def flush(self) -> None:
@@ -143,7 +146,7 @@ class Recorder(Resumable):
                 runs[index] = Execution(*run)
 
     def write(self, folder: Path) -> None:
-        """``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
+        """Write ``episodes.csv``, ``choices.csv`` and ``terminations.h5`` into ``folder``."""
         self.flush()
         Episodes.of_rows(self.episodes.rows).write(folder)
         ChoiceCounts.of_rows(self.choices).write(folder)
@@ -165,9 +168,10 @@ class Recorder(Resumable):
         folder: Path,
         distances: Callable[[Ints, Ints], Ints],
     ) -> None:
-        """``executions.csv`` into ``folder``: the last executions, option by option, in the order in which they ended.
+        """Write ``executions.csv`` into ``folder``: the last executions, option by option, in the order of their ends.
 
-        ``distances`` are of positions (n, 3) from where the sub-goals of their options (n,) truly hold, int (n,).
+        ``distances`` returns the distances, int (n,), of positions (n, 3) from where the true sub-goals of options (n,)
+        hold.
         """
         runs = self._executions()
         stopped = [run.states[-1] for run in runs]
@@ -184,17 +188,18 @@ class Recorder(Resumable):
         near: Callable[[Ints, Ints], Bools],
         log_odds: Callable[[Ints, Ints], Floats],
     ) -> None:
-        """``exploits.csv`` into ``folder``, of the same executions: how sure its own classifier was at most.
+        """Write ``exploits.csv`` into ``folder``: how sure the classifier of each of the last executions was at most.
 
-        Of states (n,) and the options (n,) that came to them ``near`` says whether these options' true sub-goals hold
-        there, or nearly, ``log_odds`` how sure their classifiers are. A cell is empty where there was no such state.
+        Both functions take states (n,) and options (n,). ``near`` returns whether each option's true sub-goal holds, or
+        nearly holds, in the state, and ``log_odds`` how sure the option's classifier is. If an execution came to no
+        state near (or far from) its sub-goal, the cell is empty.
         """
         rows = []
         for run in self._executions():
             states = np.array(run.states, int)
             options = np.full_like(states, run.option)
             is_near, sure = near(states, options), log_odds(states, options)
-            best_near = np.fmax.reduce(sure[is_near], initial=np.nan)  # NaN of none
+            best_near = np.fmax.reduce(sure[is_near], initial=np.nan)  # NaN if there is no such state
             best_far = np.fmax.reduce(sure[~is_near], initial=np.nan)
             row = (run.step, run.option, run.reached, is_near[-1], best_near, best_far)
             rows.append(row)
@@ -202,5 +207,5 @@ class Recorder(Resumable):
 
 
 def latest(options: int, most: int) -> list[deque[Any]]:
-    """For each option an empty list that keeps the last so many."""
+    """Return for each option an empty list that keeps its last ``most`` entries."""
     return [deque(maxlen=most) for _ in range(options)]

@@ -1,6 +1,6 @@
-"""Prioritised experience replay (Schaul et al. 2015) over integer state ids, of transitions over one or several steps.
+"""Prioritised experience replay (Schaul et al. 2015), of transitions over one or several steps.
 
-A transition costs bytes, not images.
+Transitions hold integer state ids, so a transition costs bytes, not images.
 """
 
 from dataclasses import dataclass, replace
@@ -11,28 +11,28 @@ import numpy as np
 from hypogoal.core.arrays import Bools, Columns, Floats, Ints
 from hypogoal.core.checkpoints import Resumable
 
-ALPHA = 0.6  # 0 samples uniformly, 1 in full proportion to priority: Schaul et al. 2015
-BETA = 0.4  # strength of the importance weights that correct for it: the same source
+ALPHA = 0.6  # 0 samples uniformly, 1 in full proportion to priority. Source: Schaul et al. 2015
+BETA = 0.4  # how far importance weights correct for the priorities. Source: Schaul et al. 2015
 Rows = TypeVar("Rows", bound=Columns)
 
 
 @dataclass(frozen=True)
 class Steps(Columns):
-    """Steps of sequences, or transitions over several of these."""
+    """Steps of sequences, or transitions over several steps, as arrays (n,)."""
 
     state: Ints  # ids
     action: Ints
     next_state: Ints  # ids
-    steps: Ints  # from state to next_state
+    steps: Ints  # the number of steps from state to next_state
 
 
 Joined = TypeVar("Joined", bound=Steps)
 
 
 class PrioritisedReplay(Resumable, Generic[Rows]):
-    """A ring of transitions (Tables 2 and 4: 1e5), sampled in proportion to priority ** alpha.
+    """A ring of transitions, sampled in proportion to priority ** alpha. In Tables 2 and 4, its length is 1e5.
 
-    What is stored is written into ``data``, rows of zeros, as many as there is room for.
+    ``data`` are the ring's rows, at first of zeros. Transitions are written into ``data``.
     """
 
     CHANGING = ("data", "priorities", "size", "next", "largest")
@@ -40,10 +40,10 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
     def __init__(self, data: Rows):
         self.data = data
         self.capacity = len(data)
-        self.priorities = np.zeros(len(data))  # to the power alpha
+        self.priorities = np.zeros(len(data))  # priority ** alpha of each row
         self.size = 0
         self.next = 0
-        self.largest = 1.0  # priority so far
+        self.largest = 1.0  # the largest priority so far
 
     def add(self, rows: Rows) -> None:
         """Append n transitions with the largest priority so far."""
@@ -55,7 +55,10 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
         self.size = min(self.size + count, self.capacity)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Ints, Floats]:
-        """Stratified in proportion to priority: indices and importance weights (count,), the largest of these 1."""
+        """Draw ``count`` indices, int64 (count,), by stratified sampling in proportion to priority.
+
+        Also returns importance weights, float32 (count,), scaled so that the largest weight is 1.
+        """
         priorities = self.priorities[: self.size]
         sums = priorities.cumsum()
         total = sums[-1]
@@ -73,32 +76,33 @@ class PrioritisedReplay(Resumable, Generic[Rows]):
         return indices, weights.astype(np.float32)
 
     def set_priorities(self, indices: Ints, errors: Floats) -> None:
-        """New priorities of sampled transitions: their absolute TD errors (n,)."""
+        """Set the priorities of sampled transitions to their absolute TD errors (n,)."""
         priorities = errors.astype(float) + 1e-3
         self.largest = max(self.largest, float(priorities.max()))
         self.priorities[indices] = priorities**ALPHA
 
 
 class StepsAhead(Resumable):
-    """Joins the steps of many sequences played side by side into transitions over up to n steps.
+    """What joins the steps of sequences that are played side by side into transitions over up to n steps.
 
-    A transition from a step reaches n steps on, or to the sequence's end where that comes sooner; never beyond.
+    A transition reaches n steps on, or to the sequence's end if that comes sooner.
     """
 
     CHANGING = ("open",)
 
     def __init__(self, sequences: int, n: int):
         self.n = n
-        self.open: list[list[tuple[int, int]]] = [[] for _ in range(sequences)]  # states and actions
+        self.open: list[list[tuple[int, int]]] = [[] for _ in range(sequences)]  # states and actions of each sequence
 
     def add(self, rows: Joined, ended: Bools) -> Joined:
-        """One step of every sequence, and which sequences end with it, bool (E,); returns the transitions now complete.
+        """Take one step of every sequence, and return the transitions that are now complete.
 
-        A transition has ``state`` and ``action`` of its first step, and all else of its last.
+        ``ended``, bool (E,), says which sequences end with the step. A transition has ``state`` and ``action`` of its
+        first step, and all else of its last step.
         """
         if self.n == 1:
             return rows
-        complete = []  # sequence, steps, state, action
+        complete = []  # rows of sequence, steps, state, action
         for sequence, steps in enumerate(self.open):
             now = rows.at(sequence)
             steps.append((now.state.item(), now.action.item()))

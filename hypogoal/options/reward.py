@@ -28,7 +28,10 @@ MEANINGS = {
 
 
 def require_observations(env: Env, ensemble: Ensemble) -> Reader:
-    """A reader of an environment's observations; a ``UserError`` if the ensemble was trained on others."""
+    """Return a reader of the environment's observations.
+
+    Raises ``UserError`` if the ensemble was trained on observations of another shape or type.
+    """
     reader, dtype, shape = reader_of(env.observation_space), ensemble.view.dtype, ensemble.observation_shape
     if (reader.shape, reader.dtype) != (shape, dtype):
         raise UserError(
@@ -40,7 +43,7 @@ def require_observations(env: Env, ensemble: Ensemble) -> Reader:
 
 
 def ensemble_at(path: Path, sub_goal: str) -> Ensemble:
-    """One sub-goal's ensemble in an artefact; without a name its only one."""
+    """Return the ensemble of ``sub_goal`` in an artefact. An empty name stands for the artefact's only sub-goal."""
     artefact = open_artefact(path, "ensemble")
     goals = artefact.config["sub_goals"]
     if not sub_goal and len(goals) == 1:
@@ -53,18 +56,18 @@ class SubgoalReward:
 
     Args:
         source: an ensemble artefact's folder, or an ensemble from :func:`hypogoal.load_ensemble`.
-        sub_goal: which of the artefact's; may be left out where there is one.
+        sub_goal: which of the artefact's sub-goals. It may be left out if there is only one.
         by: who decides: ``any`` member, more than half of them (``vote``), ``all``, which is the strictest, or one
             member by its number.
-        termination: when a member says so: ``learned``, where its prediction is positive; or a rule of one's own, as in
-            training, which :meth:`wrap` asks at every step.
+        termination: when a member says that the sub-goal holds. With ``learned``, that is where its prediction is
+            positive. It may be a rule of your own, as in training, which :meth:`wrap` asks at every step.
 
-    ``reward(observations)`` are rewards float32 (N,), 1 where the sub-goal holds, of observations as
-    :meth:`Ensemble.predict` takes them; ``reward.holds(observations)`` the same as bool (N,). Each observation stands
-    alone there, so that predictions decide, whatever the rule.
+    ``reward(observations)`` returns rewards float32 (N,), which are 1 where the sub-goal holds.
+    ``reward.holds(observations)`` returns the same as bool (N,). Both take observations as :meth:`Ensemble.predict`
+    takes them, and look at each observation alone. So predictions decide there, whatever the rule.
 
     Raises:
-        UserError: no such ensemble, sub-goal, member or rule.
+        UserError: if there is no such ensemble, sub-goal, member or rule.
     """
 
     def __init__(
@@ -77,7 +80,7 @@ class SubgoalReward:
         self.ensemble = source if isinstance(source, Ensemble) else ensemble_at(Path(source), sub_goal)
         count = len(self.ensemble)
         self.by = by
-        self.least = {"any": 1, "vote": count // 2 + 1, "all": count}  # members that have to say so
+        self.least = {"any": 1, "vote": count // 2 + 1, "all": count}  # how many members must say so
         if by not in self.least and by not in range(count):
             raise UserError(
                 "unknown rule for whether the sub-goal holds",
@@ -87,15 +90,15 @@ class SubgoalReward:
         self.rule = load_rule(termination)(self.ensemble.thresholds_as_log_odds(), count)
 
     def __call__(self, observations: Any) -> Floats:
-        """The rewards (N,) of observations."""
+        """Return the rewards of observations, float32 (N,)."""
         return self.holds(observations).astype(np.float32)
 
     def holds(self, observations: Any) -> Bools:
-        """Whether the sub-goal holds in observations: bool (N,)."""
+        """Return whether the sub-goal holds in observations, bool (N,)."""
         return self.decide(self.rule.positive(self.ensemble.log_odds(observations)))
 
     def decide(self, members: Bools) -> Bools:
-        """Whether the sub-goal holds where members say so: bool (N, K) to (N,)."""
+        """Return whether the sub-goal holds, bool (N,), given what each member says, bool (N, K)."""
         if self.by in self.least:
             return np.asarray(members.sum(1) >= self.least[self.by])
         return members[:, int(self.by)]
@@ -110,31 +113,33 @@ class SubgoalReward:
         start: str = "unpaid",
         away: int = 1,
     ) -> RewardedEnv:
-        """An environment that pays ``scale`` where the sub-goal holds, else 0.
+        """Return ``env``, wrapped so that it pays ``scale`` where the sub-goal holds, and 0 elsewhere.
 
         Args:
-            env: one whose observations are those of training.
-            scale: what it pays.
-            add: that is added to its own reward instead of replacing it.
-            ends: its episode terminates where it pays; else an agent can stay where it is rewarded.
-            start: of an episode that begins where the prediction is positive, so that doing nothing would be paid:
-                ``unpaid`` until the prediction has been negative, ``paid``, or ``refuse``, a ``UserError`` by
-                ``reset``. The first such start is a warning.
-            away: how many steps in a row the prediction has to be negative before what is ``unpaid`` pays. More than 1
-                is for a prediction that flickers: positive, negative, positive, while nothing has happened.
+            env: an environment with the observations of training.
+            scale: the reward where the sub-goal holds.
+            add: add the reward to the environment's own reward instead of replacing it.
+            ends: terminate the episode where it pays. Otherwise an agent can stay where it is rewarded.
+            start: what to do if an episode begins where the prediction is positive, so that doing nothing would be
+                paid. With ``unpaid``, nothing is paid until the prediction has been negative. With ``paid``, doing
+                nothing is paid. With ``refuse``, ``reset`` raises ``UserError``. Otherwise the first episode that
+                begins there gives a warning.
+            away: with ``unpaid``, for how many steps in a row the prediction has to be negative before anything is
+                paid. Give more than 1 if a prediction flickers: positive, negative, positive, while nothing has
+                happened.
 
-        In a forked process, as :class:`gymnasium.vector.AsyncVectorEnv` has them, torch uses one thread.
+        In a forked process, such as those of :class:`gymnasium.vector.AsyncVectorEnv`, torch uses one thread.
 
-        ``info["subgoal"]`` is ``{"predicted": bool, "paid": float}``, of ``reset`` and of every step.
+        After ``reset`` and every step, ``info["subgoal"]`` is ``{"predicted": bool, "paid": float}``.
 
         Raises:
-            UserError: other observations than those of training; an unknown ``start``; ``away`` below 1.
+            UserError: if the observations are not those of training, ``start`` is unknown, or ``away`` is below 1.
         """
         return RewardedEnv(env, self, scale, add, ends, start, away)
 
 
 class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """See :meth:`SubgoalReward.wrap`: an episode is to each member an execution of its option."""
+    """What :meth:`SubgoalReward.wrap` returns. To each member, an episode is an execution of its option."""
 
     def __init__(
         self,
@@ -158,12 +163,12 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.start, self.away = start, away
         self._rule = copy.deepcopy(reward.rule)
         self._age = 0
-        self._negatives = 0  # steps in a row
-        self._pays = True  # the prediction has been negative since the episode began
+        self._negatives = 0  # the number of steps in a row until now with a negative prediction
+        self._pays = True  # whether a positive prediction is paid by now
         self._warned = False
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Like the environment's own; nothing is paid."""
+        """Reset the environment. Nothing is paid."""
         observation, info = self.env.reset(**kwargs)
         self._age = self._negatives = 0
         [inside] = self.reward.holds(self._reader.read(observation)[None]).tolist()
@@ -173,7 +178,7 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, info | {"subgoal": {"predicted": inside, "paid": 0.0}}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """The environment's step with reward and end changed."""
+        """Step the environment, and return the step with the sub-goal's reward and end."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         [log_odds] = self.reward.ensemble.log_odds(self._reader.read(observation)[None])
         members = np.arange(len(log_odds))

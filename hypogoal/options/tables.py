@@ -17,28 +17,28 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.files import reading, replacing
 from hypogoal.domains.episodes import LAST
 
-BLANK = ("best_near", "best_far")  # columns whose cells may be empty: NaN
+BLANK = ("best_near", "best_far")  # the columns whose cells may be empty, which is NaN
 
 
 @dataclass(frozen=True)
 class Table(Columns):
-    """Columns (n,) of a file."""
+    """The columns of a CSV file, as arrays (n,)."""
 
     FILE: ClassVar[str]
 
     @classmethod
     def of_rows(cls, rows: Iterable[Sequence[float]]) -> Self:
-        """A table of rows, each with a number for every column."""
+        """Return a table of ``rows``, each of which has a number for every column."""
         listed = list(rows)
         columns = zip(*listed, strict=True) if listed else [()] * len(cls.names())
         return cls.cast(*columns)
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The table in a CSV file with a header.
+        """Return the table in a CSV file with a header.
 
-        A file that is missing, no table, or has other cells than finite numbers (or, in a ``BLANK`` column, nothing) is
-        a ``UserError``.
+        Raises ``UserError`` if the file is missing or no table, or if a cell is no finite number. Only cells of a
+        ``BLANK`` column may be empty.
         """
         from pandas import read_csv
 
@@ -54,7 +54,7 @@ class Table(Columns):
         return cls.cast(*frame.to_numpy().T)
 
     def write(self, folder: Path) -> None:
-        """The file of this table into ``folder``; a NaN is an empty cell."""
+        """Write the table's file into ``folder``. A NaN becomes an empty cell."""
         with replacing(folder / self.FILE) as fresh, fresh.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(self.names())
@@ -62,7 +62,7 @@ class Table(Columns):
                 writer.writerow(["" if math.isnan(number) else number for number in row])
 
     def rows(self) -> list[tuple[Any, ...]]:
-        """Plain numbers, row by row; truth values are 0 and 1."""
+        """Return plain numbers, row by row. Truth values are 0 and 1."""
         columns = [(getattr(self, name) * 1).tolist() for name in self.names()]
         return [*zip(*columns, strict=True)]
 
@@ -73,34 +73,34 @@ class Episodes(Table):
 
     FILE = "episodes.csv"
 
-    step: Ints  # environment steps when it ended, summed over parallel environments and stages
-    length: Ints  # steps
+    step: Ints  # the number of environment steps when the episode ended, summed over environments and stages
+    length: Ints  # the number of steps
     reward: Doubles  # undiscounted
-    terminated: Bools  # it reached a terminal state; else it was cut at the cap
-    # as its domain says; else terminated with a reward: an agent that dies reaches a terminal state too.
+    terminated: Bools  # whether the episode reached a terminal state. Otherwise it was cut, at the cap
+    # As the domain says. By default, whether it terminated with a reward, because dying is a terminal state, too.
     succeeded: Bools
 
     def last(self) -> Episodes:
-        """The last ``LAST`` episodes, or all where there are fewer."""
+        """Return the last ``LAST`` episodes, or all episodes if there are fewer."""
         return self.at(slice(-LAST, None))
 
 
 @dataclass(frozen=True)
 class ChoiceCounts(Table):
-    """Choices of options: one row per option and window of steps that ends at ``step``."""
+    """Choices of options, with one row for each option and each window of steps that ends at ``step``."""
 
     FILE = "choices.csv"
 
     step: Ints
     option: Ints  # g*K + k
-    offered: Ints  # decisions in which it was offered
-    chosen: Ints  # decisions for it
-    expected: Doubles  # decisions for it under uniform-random choice
-    reached: Ints  # executions that reached its sub-goal
-    duration: Ints  # steps of its executions
+    offered: Ints  # the number of decisions in which the option was offered
+    chosen: Ints  # the number of decisions for the option
+    expected: Doubles  # the number of decisions for the option expected under uniform-random choice
+    reached: Ints  # the number of executions that reached the option's sub-goal
+    duration: Ints  # the number of steps of the option's executions
 
     def total(self, name: str, options: int) -> Doubles:
-        """The sum of column ``name`` over all windows, (O,)."""
+        """Return the sum of column ``name`` over all windows, float64 (O,)."""
         return np.bincount(self.option, weights=getattr(self, name), minlength=options).astype(float)
 
 
@@ -110,27 +110,27 @@ class Executions(Table):
 
     FILE = "executions.csv"
 
-    step: Ints  # environment steps when it ended
+    step: Ints  # the number of environment steps when the execution ended
     option: Ints  # g*K + k
-    duration: Ints  # steps
-    reached: Bools  # its own termination classifier ended it
-    inside_at_start: Bools  # that classifier's prediction was positive where it began
-    terminated: Bools  # the episode ended in a terminal state: solved, or lost
-    room: Ints  # where it stopped; x and y too
+    duration: Ints  # the number of steps
+    reached: Bools  # whether the option's own classifier ended the execution
+    inside_at_start: Bools  # whether that classifier was positive already where the execution began
+    terminated: Bools  # whether the execution ended in a terminal state of the episode: solved, or lost
+    room: Ints  # where the execution stopped, with x and y
     x: Ints
     y: Ints
-    distance: Ints  # from there to the nearest true sub-goal, in the domain's units
+    distance: Ints  # from where it stopped to the nearest true sub-goal, in the domain's units
 
 
 @dataclass(frozen=True)
 class Exploits(Table):
-    """Of the same executions, how sure their own classifiers were at most."""
+    """How sure the options' own classifiers were at most, in the executions of :class:`Executions`."""
 
     FILE = "exploits.csv"
 
-    step: Ints  # environment steps when it ended
+    step: Ints  # the number of environment steps when the execution ended
     option: Ints  # g*K + k
-    reached: Bools  # its own termination classifier ended it
-    near: Bools  # that was near its true sub-goal
-    best_near: Doubles  # highest log-odds near the true sub-goal; NaN where it did not come near
-    best_far: Doubles  # highest log-odds far from it; NaN where it always was near
+    reached: Bools  # whether the option's own classifier ended the execution
+    near: Bools  # whether the execution ended near the option's true sub-goal
+    best_near: Doubles  # the highest log-odds near the true sub-goal, NaN if the execution never was near
+    best_far: Doubles  # the highest log-odds far from the true sub-goal, NaN if the execution always was near

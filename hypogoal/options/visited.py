@@ -19,10 +19,10 @@ VISITED = "visited.h5"
 
 
 class Visited(Resumable):
-    """A uniform sample of the distinct states visited: those whose hashes are the smallest (a bottom-k sketch).
+    """A uniform sample of the distinct states visited: the states with the smallest hashes (a bottom-k sketch).
 
     Whether a state is kept depends neither on when nor on how often it was visited, and no random numbers are drawn.
-    At ``most`` so many are kept in the end, which ones depends on ``seed``.
+    At most ``most`` states are kept in the end. Which states are kept depends on ``seed``.
     """
 
     CHANGING = ("kept",)
@@ -30,22 +30,22 @@ class Visited(Resumable):
     def __init__(self, engine: Engine, most: int, seed: int):
         self.engine, self.most = engine, most
         self.key = seed_for(seed, "visited").to_bytes(16, "little")
-        self.kept: dict[str, Observations] = {}  # pictures by their hashes, some of them surplus
+        self.kept: dict[str, Observations] = {}  # pictures by their hashes, including some surplus
 
     def see(self, ids: Ints) -> None:
-        """States (E,)."""
+        """Take the visited states ``ids`` (E,) into the sample."""
         for picture in self.engine.images(ids):
             digest = blake2b(picture.tobytes(), digest_size=7, key=self.key).digest()
-            self.kept.setdefault(digest[::-1].hex(), picture.copy())  # from the last byte on: else others are kept
+            self.kept.setdefault(digest[::-1].hex(), picture.copy())  # the order of bytes decides which are kept
         if len(self.kept) > 2 * self.most:
             self.kept = self._smallest()
 
     def _smallest(self) -> dict[str, Observations]:
-        """Those that are kept, in the order of their hashes, without surplus."""
+        """Return the states kept, in the order of their hashes, without surplus."""
         return dict(sorted(self.kept.items())[: self.most])
 
     def states(self) -> Observations:
-        """The states kept, (n, *obs)."""
+        """Return the states kept, (n, *obs)."""
         return np.stack([*self._smallest().values()])
 
     def write(
@@ -54,7 +54,7 @@ class Visited(Resumable):
         ensemble_config: Values,
         seed: int,
     ) -> None:
-        """``visited.h5`` into ``folder``: a data file of unlabelled states, of the ensemble's domain."""
+        """Write ``visited.h5`` into ``folder``: a data file of unlabelled states of the ensemble's domain."""
         sub_goals = tuple(ensemble_config["sub_goals"])
         visited = States(self.states(), np.zeros((0, 0), bool))
         none = States(visited.observations[:0], np.zeros((0, len(sub_goals)), bool))
@@ -75,9 +75,9 @@ class Visited(Resumable):
 
 
 def unlabelled_file(path: Path, dataset: Dataset) -> Path:
-    """The file of unlabelled states: ``path``, or the file of an artefact with visited states.
+    """Return the file of unlabelled states: ``path`` or, if that is an artefact's folder, its file of visited states.
 
-    No such file, or one of another domain or shape than ``dataset``, is a ``UserError``.
+    Raises ``UserError`` if there is no such file, or if its domain or observations are not those of ``dataset``.
     """
     file = path / VISITED if path.is_dir() else path
     if path.is_dir() and VISITED not in open_artefact(path, "options", "meta").manifest.files:
