@@ -20,7 +20,7 @@ from hypogoal.options.choosers import FILE
 from hypogoal.options.learner import Transitions
 from hypogoal.options.loop import OptionLoop
 
-REPLAY = 1_000  # nothing is learned: a small one
+REPLAY = 1_000  # small, because nothing is learned
 SOLVED = "solved"  # why the last option of an episode ended
 
 
@@ -29,11 +29,11 @@ class Frame:
     """One state of an episode."""
 
     observation: Observations  # (*obs)
-    step: int  # of the episode
-    option: int  # that runs in this state, or ended in it
-    predictions: tuple[bool, ...]  # of its sub-goal's K members on the state; option g*K + k goes by the k-th
-    left: int  # steps until its timeout
-    ended: str  # why it ended in this state; empty where it goes on
+    step: int  # the number of steps of the episode so far
+    option: int  # the option that runs in the state, or ended in the state
+    predictions: tuple[bool, ...]  # of the option's sub-goal's K members; option g*K + k goes by the k-th
+    left: int  # the number of steps until the option's timeout
+    ended: str  # why the option ended in the state, empty if the option goes on
 
 
 def agent_of(
@@ -42,11 +42,13 @@ def agent_of(
     environments: int = 1,
     layouts: Sequence[int] = (),
 ) -> OptionLoop:
-    """Environments in which the agent of a meta artefact plays; ``seed`` is of the draws.
+    """Return a loop in which the agent of a meta artefact plays. ``seed`` seeds its draws.
 
-    ``layouts``: one of these in each environment, instead of those that it was trained in; without its ``cap``.
+    The options of an options artefact are chosen at random. With ``layouts``, each environment plays one of the layouts
+    in place of those of training, without the artefact's ``cap``.
 
-    A file of it, or its ensemble, missing or damaged, or a domain that is not installed is a ``UserError``.
+    Raises ``UserError`` if a file of the artefact, or its ensemble, is missing or damaged, or if the domain is not
+    installed.
     """
     source = Artefact(artefact.input("ensemble"))
     settings = known(TrainMetaConfig, artefact.config)
@@ -71,7 +73,10 @@ def agent_of(
 
 
 def play_episode(loop: OptionLoop, members: int) -> list[Frame]:
-    """One episode of :func:`agent_of`, K ``members``: a frame per step, and one for where each execution ended."""
+    """Play one episode of :func:`agent_of`, with K ``members``.
+
+    Returns a frame for each step, and another frame for the state in which each execution ended.
+    """
     frames = []
     for step, moved in enumerate(_steps(loop)):
         left = loop.config.option_timeout - int(loop.age[0])
@@ -91,7 +96,7 @@ def _frame(loop: OptionLoop, members: int, option: int, ids: Ints, step: int, le
 
 
 def _why(loop: OptionLoop, moved: Transitions) -> str:
-    """Why an option ended."""
+    """Return why an option ended, in words."""
     if moved.terminated[0]:
         return SOLVED if loop.recorder.episodes.rows[-1].succeeded else "the episode, unsolved"
     if moved.timed_out[0]:
@@ -100,7 +105,10 @@ def _why(loop: OptionLoop, moved: Transitions) -> str:
 
 
 def play_episodes(loop: OptionLoop, count: int) -> Iterator[tuple[Observations, Transitions]]:
-    """So many episodes of :func:`agent_of`: observations (T + 1, *obs), the last of where it ended, and T steps."""
+    """Play ``count`` episodes of :func:`agent_of`.
+
+    Yields the observations of each episode, (T + 1, *obs), up to the state in which it ended, and its T steps.
+    """
     for _ in range(count):
         pictures, steps = [], []
         for moved in _steps(loop):
@@ -111,7 +119,7 @@ def play_episodes(loop: OptionLoop, count: int) -> Iterator[tuple[Observations, 
 
 
 def _steps(loop: OptionLoop) -> Iterator[Transitions]:
-    """The steps of an episode; options are greedy, and drawn as in training."""
+    """Play an episode and yield its steps. Actions are greedy, and options are chosen as in training."""
     played = len(loop.recorder.episodes.rows)
     while len(loop.recorder.episodes.rows) == played:
         yield loop.advance(learning=False)

@@ -17,10 +17,10 @@ Distances = Callable[[Ints, Ints], Ints]
 
 
 def nearness(setup: Setup, engine: Engine) -> Near | None:
-    """A function of states (n,) and options (n,): whether these options' true sub-goals hold, or nearly.
+    """Return a function of states (n,) and options (n,), whether the options' true sub-goals hold or nearly do.
 
-    None where the domain lacks a sub-goal of the ensemble, or options end at true sub-goals. Labels of another form
-    than bool (n, G) are a ``UserError``.
+    Returns None if the domain lacks a sub-goal of the ensemble, or if options end at true sub-goals. Raises
+    ``UserError`` if the engine's labels are not bool (n, G).
     """
     domain, sub_goals = setup.domain, setup.source["sub_goals"]
     labels, shape = engine.labels(engine.ids[:1]), (1, len(domain.sub_goals))
@@ -42,7 +42,7 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
 
 
 def distances_of(domain: Domain[Any], sub_goals: Sequence[str], members: int) -> Distances:
-    """A function of positions (n, P) and options (n,): each one's distance to its option's true sub-goal, (n,)."""
+    """Return a function of positions (n, P) and options (n,), which gives distances to true sub-goals, int64 (n,)."""
 
     def away(positions: Ints, options: Ints) -> Ints:
         distances = np.zeros(len(options), int)

@@ -13,7 +13,7 @@ from hypogoal.options.networks import WIDTH, LightNetwork, embedding_for
 
 
 class LightMetaNetwork(LightNetwork):
-    """An embedding, two dense layers, actor and critic."""
+    """An embedding and two dense layers, which actor and critic share."""
 
     def __init__(
         self,
@@ -27,14 +27,14 @@ class LightMetaNetwork(LightNetwork):
         self.outputs = _outputs(WIDTH, options)
 
     def head(self, features: Tensor) -> Tensor:
-        """float32 (N, O + 1): a score per option, then the value."""
+        """Return a score for each option, then the value, float32 (N, O + 1)."""
         return self.outputs(features)
 
 
 class PaperMetaNetwork(nn.Module):
-    """The paper's, of pictures: three convolutions with ReLU between, a dense layer, shared by actor and critic.
+    """The paper's network of pictures: three convolutions with ReLU and a dense layer, which actor and critic share.
 
-    The paper gives no sizes; 16, 32 and 32 channels with kernel 3 and stride 2, dense 256, are ours.
+    The paper gives no sizes. 16, 32 and 32 channels, kernels of 3, strides of 2 and a dense layer of 256 are ours.
     """
 
     def __init__(self, observation_shape: Shape, options: int):
@@ -51,13 +51,13 @@ class PaperMetaNetwork(nn.Module):
         self.outputs = _outputs(256, options)
 
     def forward(self, images: Tensor) -> Tensor:
-        """uint8 (N, H, W, C) -> float32 (N, O + 1): a score per option, then the value."""
+        """Return a score for each option, then the value, float32 (N, O + 1), of images uint8 (N, H, W, C)."""
         features = self.features(as_input(images))
         return self.outputs(self.dense(features))
 
 
 def _outputs(width: int, options: int) -> Linear:
-    """A layer that begins with nearly uniform choices, so that early updates do not rest on the initialisation."""
+    """Return an output layer whose choices are nearly uniform, so that early updates do not rest on chance weights."""
     layer = Linear(width, options + 1)
     with torch.no_grad():
         layer.weight.mul_(0.01)
@@ -66,15 +66,15 @@ def _outputs(width: int, options: int) -> Linear:
 
 
 def among(scores: Tensor, offered: Tensor) -> Tensor:
-    """Scores (N, O), minus infinity of options that are not offered."""
+    """Return scores (N, O), which are minus infinity for options that are not offered."""
     return scores.masked_fill(~offered, -torch.inf)
 
 
 class Head(nn.Module, ABC):
-    """How an option is drawn from the actor's scores (N, O) among those offered, bool (N, O).
+    """A way to draw an option from the actor's scores (N, O), among the options ``offered``, bool (N, O).
 
     Attributes:
-        remembered: how many numbers of a draw are remembered, R.
+        remembered: R, the number of numbers that are remembered of a draw.
     """
 
     remembered: int
@@ -86,7 +86,7 @@ class Head(nn.Module, ABC):
         offered: Tensor,
         generator: torch.Generator,
     ) -> tuple[Tensor, Tensor]:
-        """Options int64 (N,), and what is remembered of the draw, float32 (N, R)."""
+        """Draw options, int64 (N,). Return the options and what is remembered of the draws, float32 (N, R)."""
 
     @abstractmethod
     def log_prob(
@@ -95,11 +95,11 @@ class Head(nn.Module, ABC):
         offered: Tensor,
         drawn: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Log probability of the draws and the entropy of what is drawn, float32 (N,) each."""
+        """Return the log probability of the draws ``drawn``, and the entropy of the distribution, float32 (N,) each."""
 
 
 class CategoricalHead(Head):
-    """A softmax over the options offered; the number of the one drawn is remembered."""
+    """A softmax over the options offered. The number of the option drawn is remembered."""
 
     remembered = 1
 
@@ -125,10 +125,10 @@ class CategoricalHead(Head):
 
 
 class GaussianHead(Head):
-    """The paper's Gaussian policy head: scores (N, O) are drawn, and remembered; the best offered is played.
+    """The paper's Gaussian policy head, which draws scores (N, O) and plays the offered option with the highest score.
 
-    Its entropy is that of the drawn scores. It depends on their spread alone, so an entropy bonus cannot keep the
-    choice from becoming certain.
+    The drawn scores are remembered. The entropy is that of the drawn scores. The entropy depends on their spread alone,
+    so an entropy bonus cannot keep the choice from becoming certain.
     """
 
     def __init__(self, options: int):
@@ -161,5 +161,5 @@ class GaussianHead(Head):
 
 
 def make_head(name: str, options: int) -> Head:
-    """The head that the setting ``head`` names."""
+    """Return the head that the setting ``head`` names, for ``options`` options."""
     return GaussianHead(options) if name == "gaussian" else CategoricalHead()

@@ -1,4 +1,4 @@
-"""The meta-policy: PPO (Schulman et al. 2017) over options, decisions weighted by their duration."""
+"""The meta-policy: PPO (Schulman et al. 2017) over options, with decisions discounted by their duration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,27 +24,27 @@ from hypogoal.options.double_dqn import descend
 from hypogoal.options.networks import apply_to_states
 
 GRADIENT_NORM = 0.5
-CLIP = 0.2  # of the ratio of probabilities: Schulman et al. 2017
-VALUE_WEIGHT = 0.5  # of the value loss: Schulman et al. 2017
-ENTROPY_WEIGHT = 0.01  # of the entropy bonus: Table 5
-# What is logged of an update, means over its batches, by stable-baselines3's names.
+CLIP = 0.2  # the clipping range of the ratio of probabilities. Source: Schulman et al. 2017
+VALUE_WEIGHT = 0.5  # the weight of the value loss. Source: Schulman et al. 2017
+ENTROPY_WEIGHT = 0.01  # the weight of the entropy bonus. Source: Table 5
+# The names, by stable-baselines3, of what is logged of an update: means over its batches.
 HEALTH = ("policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction")
 
 
 @dataclass(frozen=True)
 class Draws(Columns):
-    """Choices of an option, arrays (n, ...)."""
+    """Choices of options, as arrays (n, ...)."""
 
-    state: Ints  # in which it was chosen
-    offered: Bools  # (n, O)
-    drawn: Floats  # what the head remembers of the draw, (n, R)
+    state: Ints  # the state in which the option was chosen
+    offered: Bools  # (n, O), which options were offered
+    drawn: Floats  # (n, R), what the head remembers of the draw
     log_prob: Floats
 
 
 class MetaPolicy(choosers.Chooser):
-    """Chooses among O options for every environment and learns from what they return.
+    """A chooser among O options for every environment, which learns from what the options return.
 
-    ``seed`` is of weights, draws and minibatches; the networks are on ``device``, options are drawn on the CPU.
+    ``seed`` seeds weights, draws and minibatches. The networks are on ``device``, and options are drawn on the CPU.
     """
 
     CHANGING = ("policy", "optimiser", "generator", "rng", "running", "draws", "outcomes", "updates")
@@ -70,18 +70,18 @@ class MetaPolicy(choosers.Chooser):
         self.generator = seeding.torch_generator(seed, "meta-draws")
         self.rng = seeding.rng_for(seed, "meta-batches")
         count = engine.count
-        self.running = replace(  # the last one of every environment
+        self.running = replace(  # the last choice in every environment
             Draws.zeros(count),
             offered=np.zeros((count, options), np.bool_),
             drawn=np.zeros((count, self.head.remembered), np.float32),
         )
-        self.draws: list[Draws] = []  # decisions since the last update, as they ended,
-        self.outcomes: list[choosers.Outcome] = []  # and what came of them
+        self.draws: list[Draws] = []  # the decisions since the last update, in the order of their ends
+        self.outcomes: list[choosers.Outcome] = []  # what came of the decisions
         self.updates = 0
 
     @classmethod
     def refuse(cls, config: OptionConfig, engine: Engine) -> None:
-        """The paper's network sees pictures only."""
+        """Raise ``UserError`` if ``meta_network`` is ``paper`` and observations are no pictures."""
         if config.part(MetaConfig).meta_network == "paper" and engine.observation_dtype != PICTURE:
             raise UserError(
                 "the paper's networks see pictures only",
@@ -102,7 +102,7 @@ class MetaPolicy(choosers.Chooser):
 
     @staticmethod
     def reach(config: OptionConfig) -> int:
-        """The states in which decisions were made that wait for the next update, and those that they led to."""
+        """Return how many states back the decisions reach that wait for the next update."""
         decisions = config.part(MetaConfig).decisions
         return (decisions + config.environments) * config.option_timeout + STACK * config.environments
 
@@ -142,13 +142,13 @@ class MetaPolicy(choosers.Chooser):
         return apply_to_states(self.network, self.engine, ids, self.device)
 
     def update(self, draws: Draws, outcomes: choosers.Outcome) -> dict[str, float]:
-        """Learn from decisions, those of an environment side by side in the order in which they were taken."""
+        """Learn from decisions, which are sorted by environment and then by time. Return numbers to log."""
         config = self.config
         with torch.no_grad():
             outputs = self._outputs(draws.state)
             following = self._outputs(outcomes.next_ids)
         values = outputs[:, -1].double().cpu().numpy()
-        last = np.diff(outcomes.environments, append=-1) != 0  # what comes next is another environment's
+        last = np.diff(outcomes.environments, append=-1) != 0  # the next decision is another environment's
         advantages = smdp.smdp_advantages(
             outcomes.returns,
             outcomes.discounts,
@@ -196,7 +196,7 @@ class MetaPolicy(choosers.Chooser):
         return dict(self.policy.state_dict())
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Weights of an artefact; a ``UserError`` where they are not of such a policy."""
+        """Load the weights of an artefact. Raises ``UserError`` if they do not fit."""
         load_into(self.policy, state, choosers.FILE)
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -211,7 +211,7 @@ def clipped_surrogate(
     advantages: Tensor,
     clip: float,
 ) -> Tensor:
-    """PPO's loss: minus the mean of min(r A, clip(r, 1 - c, 1 + c) A), r the ratio of probabilities.
+    """Return PPO's loss, minus the mean of min(r A, clip(r, 1 - c, 1 + c) A), where r is the ratio of probabilities.
 
     Source: Schulman et al. 2017, Eq. (7).
     """
@@ -220,9 +220,10 @@ def clipped_surrogate(
 
 
 def changes(log_prob: Tensor, old: Tensor, clip: float) -> tuple[Tensor, Tensor]:
-    """How far a policy went from the one that drew (n,): the mean of r - 1 - log r, and the share that is clipped.
+    """Return how far a policy went from the policy that drew: the mean of r - 1 - log r, and the share that is clipped.
 
-    The first estimates the Kullback-Leibler divergence without bias (Schulman 2020, "Approximating KL divergence").
+    r (n,) is the ratio of the policies' probabilities. The mean estimates the Kullback-Leibler divergence without bias.
+    Source: Schulman 2020, "Approximating KL divergence".
     """
     ratio = (log_prob - old).exp()
     kl = (ratio - 1 - (log_prob - old)).mean()

@@ -1,4 +1,4 @@
-"""An agent put together: whose options are played, in which environments, where they end, who learns and chooses."""
+"""The assembly of an agent from its environments, its options, where options end, and what learns and chooses."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,15 +22,15 @@ from hypogoal.options.visited import Visited
 
 @dataclass(frozen=True)
 class Setup:
-    """Whose options are played, where, and how they are learned and chosen.
+    """What an agent is assembled from: whose options are played, where, and how they are learned and chosen.
 
     Attributes:
-        domain: where.
-        source: the configuration of the ensemble; of another classifier what it has in common with one.
-        folder: of the ensemble.
-        config: of the options' policies, of the one over them, of the world.
-        seed: of weights, exploration, choices and, where there are several, layouts and start states.
-        device: of the networks.
+        domain: where options are played.
+        source: the configuration of the ensemble. For another classifier, the settings that an ensemble has, too.
+        folder: the folder of the ensemble.
+        config: the settings of the option policies, of the policy over options, and of the world.
+        seed: the seed of weights, exploration and choices, and of layouts and start states if there are several.
+        device: the device of the networks.
     """
 
     domain: Domain[Any]
@@ -42,17 +42,17 @@ class Setup:
 
     @property
     def members(self) -> int:
-        """Options of each sub-goal: one for each member, or for the truth."""
+        """The number of options of each sub-goal, one for each member, or one for the truth."""
         return 1 if self.config.termination == ends.ORACLE else self.source["members"]
 
     @property
     def options(self) -> int:
-        """Options of all sub-goals."""
+        """The number of options of all sub-goals."""
         return len(self.source["sub_goals"]) * self.members
 
     @property
     def world(self) -> dict[str, Any]:
-        """The domain's settings with which they play."""
+        """The domain's settings with which options are played."""
         return world.played_world(
             self.domain,
             self.source["domain_config"],
@@ -65,9 +65,10 @@ def assemble(
     terminations_of: Callable[[Setup, Engine], ends.Terminations] | None = None,
     layouts: Layouts | None = None,
 ) -> OptionLoop:
-    """Environments, options in them, fresh policies of these and over these; each part refuses what it cannot do.
+    """Build an :class:`OptionLoop` with untrained option policies and an untrained policy over options.
 
-    ``terminations_of`` says where options end, by default as the ensemble predicts; ``layouts`` replace the setting.
+    ``terminations_of`` says where options end, by default as the ensemble predicts. ``layouts`` replace the setting of
+    that name. Raises ``UserError`` if a part does not work with the settings.
     """
     config, seed, device = setup.config, setup.seed, setup.device
     engine = make_engine(setup, layouts)
@@ -82,7 +83,7 @@ def assemble(
 
 
 def make_engine(setup: Setup, layouts: Layouts | None = None) -> Engine:
-    """Environments that begin episodes where the settings say, or in these ``layouts``."""
+    """Return environments that begin episodes where the settings say, or in ``layouts``."""
     domain, config = setup.domain, setup.config
     if layouts is None and config.layouts.strip():
         seeds = layout_seeds(config.layouts, config.layout_seed)
@@ -97,12 +98,12 @@ def make_engine(setup: Setup, layouts: Layouts | None = None) -> Engine:
 
 
 def frames_kept(config: PlayConfig, options: int) -> int:
-    """How many states back an engine must remember: those in replays and in the meta-policy's decisions."""
+    """Return how many states back an engine must remember, for replays and for the meta-policy's decisions."""
     return max(load_learner(config.network).reach(config, options), load_chooser(config.chooser).reach(config))
 
 
 def require_memory(engine: Engine, config: PlayConfig, options: int) -> None:
-    """Refuse (``UserError``) an engine that forgets states which replays or the meta-policy's decisions still need."""
+    """Raise ``UserError`` if the engine forgets states that replays or the meta-policy's decisions still need."""
     needed = frames_kept(config, options)
     if engine.memory is not None and needed > engine.memory:
         raise UserError(
@@ -113,9 +114,9 @@ def require_memory(engine: Engine, config: PlayConfig, options: int) -> None:
 
 
 def of_ensemble(setup: Setup, engine: Engine) -> ends.Terminations:
-    """Terminations of an ensemble's members, or of its sub-goals where they truly hold (``termination=oracle``).
+    """Return terminations by an ensemble's members or, with ``termination=oracle``, by its true sub-goals.
 
-    Agents see numbers by the standard that the members have.
+    If observations are numbers, this also sets the engine's standard to that of the members.
     """
     config, sub_goals = setup.config, setup.source["sub_goals"]
     oracle, numbers = config.termination == ends.ORACLE, engine.observation_dtype != PICTURE
@@ -136,5 +137,5 @@ def of_ensemble(setup: Setup, engine: Engine) -> ends.Terminations:
     many = engine.layouts is not None and engine.layouts.many
     reachable = None if many else engine.reachable()
     if reachable is not None:
-        terminations.of(reachable)  # faster than state by state
+        terminations.of(reachable)  # judged at once, which is faster than state by state
     return terminations
