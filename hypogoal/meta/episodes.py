@@ -31,7 +31,7 @@ class Frame:
     observation: Observations  # (*obs)
     step: int  # the number of steps of the episode so far
     option: int  # the option that runs in the state, or ended in the state
-    predictions: tuple[bool, ...]  # of the option's sub-goal's K members; option g*K + k goes by the k-th
+    predictions: tuple[bool, ...]  # of the K members of its sub-goal; option g*K + k goes by the k-th
     left: int  # the number of steps until the option's timeout
     ended: str  # why the option ended in the state, empty if the option goes on
 

@@ -17,7 +17,7 @@ Distances = Callable[[Ints, Ints], Ints]
 
 
 def nearness(setup: Setup, engine: Engine) -> Near | None:
-    """Return a function of states (n,) and options (n,), whether the options' true sub-goals hold or nearly do.
+    """Return a function of states (n,) and options (n,). It returns whether true sub-goals hold, or nearly, bool (n,).
 
     Returns None if the domain lacks a sub-goal of the ensemble, or if options end at true sub-goals. Raises
     ``UserError`` if the engine's labels are not bool (n, G).
@@ -42,7 +42,7 @@ def nearness(setup: Setup, engine: Engine) -> Near | None:
 
 
 def distances_of(domain: Domain[Any], sub_goals: Sequence[str], members: int) -> Distances:
-    """Return a function of positions (n, P) and options (n,), which gives distances to true sub-goals, int64 (n,)."""
+    """Return a function of positions (n, P) and options (n,). It returns distances to true sub-goals, int64 (n,)."""
 
     def away(positions: Ints, options: Ints) -> Ints:
         distances = np.zeros(len(options), int)

@@ -102,7 +102,7 @@ class MetaPolicy(choosers.Chooser):
 
     @staticmethod
     def reach(config: OptionConfig) -> int:
-        """Return how many states back the decisions reach that wait for the next update."""
+        """Return how many states back the decisions that wait for the next update reach."""
         decisions = config.part(MetaConfig).decisions
         return (decisions + config.environments) * config.option_timeout + STACK * config.environments
 
