@@ -171,6 +171,7 @@ class RewardedEnv(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Reset the environment. Nothing is paid."""
         observation, info = self.env.reset(**kwargs)
         self._age = self._negatives = 0
+        self._rule.begin_episodes(np.arange(len(self.reward.ensemble)))
         [inside] = self.reward.holds(self._reader.read(observation)[None]).tolist()
         if inside:
             self._meet_start_inside()

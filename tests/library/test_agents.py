@@ -273,6 +273,17 @@ def test_a_classifier_rewards_and_terminates(ensemble: Ensemble, by: str | int) 
     assert [both.step(1)[1] for _ in range(3)] == [0, 0, 1.5]
 
 
+def test_the_rule_of_a_reward_is_told_where_episodes_begin(ensemble: Ensemble, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in training, because a rule may count per episode; each member is asked as an environment of its own."""
+    told: list[list[int]] = []
+    monkeypatch.setattr(TerminationRule, "begin_episodes", lambda _, members: told.append(members.tolist()))
+    env = hypogoal.SubgoalReward(ensemble).wrap(corridor())
+    for _ in range(2):
+        env.reset(seed=0)
+        env.step(1)
+    assert told == [[*range(len(ensemble))]] * 2
+
+
 def test_a_classifier_ends_an_episode(made: Path) -> None:
     """Spec D1: the left end is no end of the task, and of the episode only with the wrapper."""
     reward = hypogoal.SubgoalReward(made / "ensemble", "left-end")
