@@ -129,18 +129,18 @@ def lines(details: Details) -> list[str]:
         facts["command"] = shlex.join(facts["command"])
         facts["files"] = [*facts["files"]]
     settings = facts.pop("config")
-    rows = [f"{name}: {_typed(value)}" for name, value in facts.items()]
-    rows += [f"  {name}={_typed(value)}" for name, value in settings.items()]
+    rows = [f"{name}: {_in_words(value)}" for name, value in facts.items()]
+    rows += [f"  {name}={_in_words(value)}" for name, value in settings.items()]
     text = [heading]
     for row in rows:
         text += textwrap.wrap(row, WIDTH, subsequent_indent="    ", break_on_hyphens=False, break_long_words=False)
     return text
 
 
-def _typed(value: Any) -> str:
+def _in_words(value: Any) -> str:
     """Return a value as one would type it."""
     if isinstance(value, dict):
-        value = [f"{name} {_typed(part)}" for name, part in value.items()]
+        value = [f"{name} {_in_words(part)}" for name, part in value.items()]
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 

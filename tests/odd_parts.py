@@ -123,7 +123,7 @@ class Unsaved(Straight):
 
 class Negative(Straight):
     def greedy(self, ids: Any, options: Any, age: Any) -> Any:
-        return np.full(len(ids), -1)
+        return np.arange(len(ids)) - 1
 
 
 class Twice(TerminationRule):

@@ -108,7 +108,7 @@ class Stage:
         """The command of the command line."""
 
         def called(**values: Any) -> None:
-            typed = self._typed(values)
+            typed = self._take_settings(values)
             source = values.pop(self.source.name)
             call, done = self.run(source, values.pop("out"), values, typed)
             if not (call.quiet or done.told):
@@ -133,9 +133,9 @@ class Stage:
         """Return the arguments and options in a command's words, and the settings that they give. Nothing is run."""
         with self.command.make_context(self.name, [*words]) as context:
             values = dict(context.params)
-        return values, self._typed(values)
+        return values, self._take_settings(values)
 
-    def _typed(self, values: dict[str, Any]) -> dict[str, Any]:
+    def _take_settings(self, values: dict[str, Any]) -> dict[str, Any]:
         """Remove the settings from the ``values`` of options, and return them. ``--set`` wins."""
         from hypogoal.core.config import assigned
 
@@ -215,8 +215,14 @@ def _kept(call: Call, then: str) -> Iterator[str]:
 
 
 def _as_path(parameter: Parameter, value: Any) -> Any:
-    """Return what Python gave for a path (a text, a path or what a stage made, or several of these) as paths."""
-    if value is None or "Path" not in str(parameter.annotation):
+    """Return what Python gave for a path (a text, a path or what a stage made, or several of these) as paths.
+
+    Where several may be given, one alone becomes a list.
+    """
+    annotation = str(parameter.annotation)
+    if value is None or "Path" not in annotation:
         return value
-    several = isinstance(value, Iterable) and not isinstance(value, str)
-    return [*map(Path, value)] if several else Path(value)
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return [*map(Path, value)]
+    path = Path(value)
+    return [path] if "list[" in annotation else path

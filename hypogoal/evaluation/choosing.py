@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 LEAST = 20.0  # expected choices of a member; with fewer, its preference is not told
 DIFFERENCE = 0.2  # between members' qualities; with less, there is nothing to choose
 MEMORYLESS = ("light", "planned")  # option policies that can be asked in any state
+RULES_OF_STATES = ("learned", "oracle")  # values of ``termination`` that end an option by its state alone
 OF_PLAY = ("success", "near", "length")
 OF_CHOICE = ("within_rho", "pair", "score")
 FROZEN = "frozen"  # the scope of episodes that are played after training
@@ -154,7 +155,7 @@ def rows(work):
 def is_playable(artefact: Artefact) -> bool:
     """Return whether an agent learned to choose, on one layout of a known domain, among options without memory."""
     config = artefact.config
-    if choice_of(artefact) != "learned" or ":" in config["termination"]:  # a user's own rule may need more than a state
+    if choice_of(artefact) != "learned" or config["termination"] not in RULES_OF_STATES:
         return False
     # Many layouts have too many states to say what follows in each.
     if config["network"] not in MEMORYLESS or config.get("layouts"):

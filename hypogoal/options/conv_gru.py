@@ -164,8 +164,7 @@ class PaperLearner(Learner):
             member = self.members[option]
             member.replay.add(steps.at(rows))
             member.due += rows.sum().item()
-        np.add.at(self.positives, moved.options[moved.reached], 1)
-        self.count(moved.options)
+        self.count_running(moved)
 
     def learn(self) -> dict[str, float]:
         """Make the updates that are due. In Tables 2 and 4, one update is due per 4 steps of the member."""

@@ -39,7 +39,7 @@ class Transitions(Columns):
     options: Ints  # the options that were running
     terminated: Bools  # whether the task is over
     reached: Bools  # whether the option reached its sub-goal
-    timed_out: Bools  # whether the option's time was up before it reached its sub-goal
+    timed_out: Bools  # whether the option's time was up, though neither its sub-goal nor the episode's end was reached
     ended: Bools  # whether the option stopped here, for whatever reason
 
 
@@ -157,6 +157,12 @@ class Learner(Part, ABC):
         if explore and self.settings:
             chosen = self.exploration.mix(chosen, self.epsilon()[options], age)
         return chosen
+
+    def count_running(self, moved: Transitions) -> None:
+        """Count a step of learning for each running option, and the steps after which its member's answer is positive."""
+        reached = self.terminations.of_running(moved.next_ids, moved.options)
+        np.add.at(self.positives, moved.options[reached], 1)
+        self.count(moved.options)
 
     def count(self, options: Ints) -> None:
         """Count one step of learning for each of ``options`` (n,).

@@ -20,7 +20,8 @@ policies that learn:
   runs on into the next decision. The next decision is made in that state, and may choose the same option again.
 - the episode ends. If it is ``terminated``, the task is over, so the values of what follows are 0 for both policies. If
   it is ``truncated``, the episode is cut, at its ``max_episode_steps`` or at its cap. A cut is no terminal state, so
-  the value of the state counts for both policies, but the trace of the policy over options ends.
+  the value of the state counts for both policies, but the trace of the policy over options ends. ``chooser=symbols``
+  has no such value, and counts the execution as one that led back to where it began.
 
 With ``restart_options``, the end of an execution is also the end of its episode, and the episode counts as cut. With
 ``experience=shared``, every member of every sub-goal learns from each step, by its own prediction of the state.
@@ -151,7 +152,7 @@ class OptionLoop(Resumable):
         self.returns += self.gamma**self.age * step.rewards
         self.age += 1
         over = step.terminated | step.truncated
-        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~step.terminated
+        timed_out = (self.age >= self.config.option_timeout) & ~reached & ~over
         ended = reached | timed_out | over  # each of the three events ends an execution
         moved = Transitions(
             ids,

@@ -55,9 +55,7 @@ class PlannedLearner(Learner):
 
     def observe(self, moved: Transitions) -> None:
         """Count the steps and the sub-goals reached, from which nothing else is learned."""
-        reached = self.terminations.of_running(moved.next_ids, moved.options)
-        np.add.at(self.positives, moved.options[reached], 1)
-        self.count(moved.options)
+        self.count_running(moved)
 
 
 def plan_of(

@@ -1,7 +1,7 @@
 """Rules that decide when an option has reached its sub-goal. Every loop that plays options asks a rule.
 
-An execution ends at the first of three events (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance`` and
-``OptionEnv.step``). Its sub-goal is reached, as :meth:`TerminationRule.reached` says. Or the execution has taken
+An execution ends at the first of three events (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance``; they are
+the same in ``OptionEnv.step``). Its sub-goal is reached, as :meth:`TerminationRule.reached` says. Or the execution has taken
 ``option_timeout`` steps. Or its episode ends.
 
 By default the sub-goal is reached where the prediction of the option's own member is positive, which means that the

@@ -32,7 +32,7 @@ BROKEN = [
     ("--chooser", "Moody", "again: options"),
     ("--chooser", "Turning", "Name in CHANGING all that changes."),
     ("--chooser", "Unnamed", "resumes: your code raised AttributeError: 'Unnamed' object has no attribute 'memory'"),
-    ("--learner", "Negative", "plays: greedy gave -1 to -1: Negative. Give int64 (4,), from 0 to 6."),
+    ("--learner", "Negative", "plays: greedy gave -1 to 2: Negative. Give int64 (4,), from 0 to 6."),
     ("--learner", "Unsaved", "is kept: table is another one when loaded"),
     ("--termination", "Counts", "plays: reached gave int64 (4,)"),
     ("--view", "Unready", "object has no attribute 'shape': odd_parts.py, class Unready"),

@@ -66,6 +66,14 @@ def test_what_would_end_a_command_is_an_error(corridor_run: Path, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
+def test_one_file_may_be_given_where_several_may(corridor_run: Path, tmp_path: Path) -> None:
+    """Data files of unlabelled states: one, or a list."""
+    data = corridor_run / "data.h5"
+    one = hypogoal.train_ensemble(data, out=tmp_path / "one", unlabelled=data, **FEW)
+    several = hypogoal.train_ensemble(data, out=tmp_path / "several", unlabelled=[data], **FEW)
+    assert open_artefact(one.path).manifest.files == open_artefact(several.path).manifest.files
+
+
 def test_domains_of_another_program_and_of_another_name(tmp_path: Path) -> None:
     """An object is found by its own name, in its program."""
     data = hypogoal.collect(Here(), out=tmp_path / "data.h5", quiet=True)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from corridor import LENGTH, Corridor
 from numpy.typing import NDArray
+from odd_parts import Never
 from option_loops import QUICK, Chosen, Scripted, loop_of, played
 
 from hypogoal.meta.config import MetaConfig
@@ -61,6 +62,14 @@ def test_a_task_that_ends_when_time_is_up_was_not_timed_out() -> None:
     assert last.timed_out.tolist() == last.reached.tolist() == [False]
 
 
+def test_an_episode_that_is_cut_when_time_is_up_was_not_timed_out() -> None:
+    """Spec D1: the trace of the policy over options ends."""
+    loop = loop_of(Corridor(1, max_steps=2), Scripted(1, 0), Chosen(), option_timeout=2)
+    last = played(loop, 2).learner.seen[-1]
+    assert last.ended.tolist() == [True] and last.timed_out.tolist() == last.reached.tolist() == [False]
+    assert loop.chooser.outcomes[-1].truncated.tolist() == [True]
+
+
 def test_a_cut_episode_is_truncated_not_terminated() -> None:
     """Spec D2: the cap is no terminal state."""
     loop = played(script(Corridor(1, max_steps=1), 0), 1)
@@ -107,6 +116,18 @@ def test_a_rule_is_told_where_episodes_begin() -> None:
     assert rule.ends.tolist() == [1, 1]
     loop.begin_anew(loop.chooser)
     assert rule.ends.tolist() == [0, 0] and not loop.recorder.episodes.rows
+
+
+@pytest.mark.usefixtures("small_gru")
+@pytest.mark.parametrize("network", ["light", "paper"])
+def test_positives_are_counted_by_the_member_whatever_the_rule(network: str) -> None:
+    """Spec D8: rewards follow the member's predictions, so exploration falls from the first of them on."""
+    engine = Corridor(1)
+    ends = Terminations(lambda ids: engine.labels(ids) - 0.5, Never(np.zeros(2, np.float32)))
+    own = {"experience": "own", "mask_reached": False, "environments": 1, "replay": 100, "option_timeout": 5}
+    loop = played(loop_of(engine, ends=ends, network=network, **own), 60)
+    assert loop.learner.positives.sum() > 0
+    assert not any(loop.recorder.stops)
 
 
 def test_offered_options() -> None:
