@@ -159,7 +159,7 @@ class Learner(Part, ABC):
         return chosen
 
     def count_running(self, moved: Transitions) -> None:
-        """Count a step of learning for each running option, and the steps after which its member's answer is positive."""
+        """Count a step for each running option, and the steps after which the option's own member says yes."""
         reached = self.terminations.of_running(moved.next_ids, moved.options)
         np.add.at(self.positives, moved.options[reached], 1)
         self.count(moved.options)

@@ -1,8 +1,8 @@
 """Rules that decide when an option has reached its sub-goal. Every loop that plays options asks a rule.
 
 An execution ends at the first of three events (``reached``, ``timed_out``, ``over`` in ``OptionLoop.advance``; they are
-the same in ``OptionEnv.step``). Its sub-goal is reached, as :meth:`TerminationRule.reached` says. Or the execution has taken
-``option_timeout`` steps. Or its episode ends.
+the same in ``OptionEnv.step``). Its sub-goal is reached, as :meth:`TerminationRule.reached` says. Or the execution has
+taken ``option_timeout`` steps. Or its episode ends.
 
 By default the sub-goal is reached where the prediction of the option's own member is positive, which means that the
 member's log-odds lie above its threshold. Another rule is another subclass, which the setting ``termination`` names.

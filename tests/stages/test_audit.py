@@ -199,7 +199,7 @@ DOOR = "--domain doorkey --sub-goal go-to-goal"
         (f"{__name__}:left_end {DOOR} --set mend=0.4", "mend must be above the threshold 0.5"),
         (f"{__name__}:left_end {DOOR} --set termination=oracle", "an audit takes one classifier only"),
         (f"{__name__}:left_end --domain own_domain:DOMAIN --sub-goal left-end", "cannot begin an episode on request"),
-        ("{ensemble} --domain doorkey --sub-goal open-red-door --member 2", "no such member: 2. Give --member, 0 to 1."),
+        ("{ensemble} --domain doorkey --sub-goal open-red-door --member 2", "member: 2. Give --member, 0 to 1."),
         ("{ensemble} --domain doorkey --sub-goal go-to-goal", "unknown sub-goal: go-to-goal"),
     ],
 )
