@@ -236,7 +236,7 @@ class AnyState(Whole):
 
 class Share(Whole):
     def pools(self, labels: Any, origins: Any) -> Any:
-        return [np.flatnonzero(labels)], 5
+        return [np.flatnonzero(labels)], 1
 
 
 def shade(observations: Any, labels: Any, unlabelled: Any, members: int, seed: int) -> Any:

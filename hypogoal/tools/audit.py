@@ -48,10 +48,10 @@ def audit(
     probabilities (N,). The truth is that of the domain's ``sub_goal``. Without a domain, the classifier is audited on
     recorded data.
     """
-    from hypogoal.tools.audit_recorded import audited
+    from hypogoal.tools.audit_recorded import audit_data
 
     if domain is None:
-        lines, shares = audited(call, classifier, data, sub_goal, member)
+        lines, shares = audit_data(call, classifier, data, sub_goal, member)
     elif sub_goal is None or data is not None:
         raise UserError("where is played, the domain has the truth", domain, "Give --sub-goal NAME, and no --data.")
     else:

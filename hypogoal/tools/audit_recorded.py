@@ -32,7 +32,7 @@ COLUMNS = ["name", "label", "row", "digest", "disagreement"]
 CARDS, FAILURES = 20, 4  # on the page: states to label next, and each member's failures
 
 
-def audited(
+def audit_data(
     call: Call,
     source: str,
     data: Path | None,

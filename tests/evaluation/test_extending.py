@@ -16,6 +16,12 @@ from hypogoal.stages.report import report
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
+def test_numbers_in_words() -> None:
+    """From three in a row on, the first and the last."""
+    assert page.spans([972, 5, 970, 971, 3, 4, 8, 9]) == "3 to 5, 8, 9 and 970 to 972"
+    assert page.spans([2]) == "2" and page.spans([]) == "none"
+
+
 def test_a_figure_with_its_number_is_one_file_and_one_line(small_ladders, tmp_path, monkeypatch):
     """The example as it stands: table, section, figure, and the figure for a paper."""
     monkeypatch.syspath_prepend(EXAMPLES)
