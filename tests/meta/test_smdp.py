@@ -11,6 +11,7 @@ from corridor import Corridor
 from numpy.typing import NDArray
 from stable_baselines3.common.utils import explained_variance as theirs
 
+from hypogoal.core.errors import UserError
 from hypogoal.meta import smdp
 from hypogoal.meta.config import MetaConfig
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, among
@@ -174,3 +175,13 @@ def test_where_nothing_is_to_be_gained_choices_become_less_certain(head: str, mo
     draws = replace(draws_in(np.arange(6) % 5), drawn=np.zeros((6, policy.head.remembered), np.float32))
     entropies = [-policy.update(draws, outcomes)["entropy_loss"] for _ in range(3)]
     assert entropies == sorted(entropies) and entropies[-1] > entropies[0] + 1e-3
+
+
+def test_the_papers_network_sees_pictures_only() -> None:
+    """Refused before training, in a line that names the setting."""
+    config = MetaConfig.of(meta_network="paper")
+    engine = Corridor(1)
+    MetaPolicy.refuse(config, engine)
+    engine.observation_dtype = "float32"
+    with pytest.raises(UserError, match="see pictures only: meta_network=paper"):
+        MetaPolicy.refuse(config, engine)
