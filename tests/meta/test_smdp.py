@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import explained_variance as theirs
 
 from hypogoal.core.errors import UserError
 from hypogoal.meta import smdp
-from hypogoal.meta.config import MetaConfig
+from hypogoal.meta.config import MetaConfig, TrainMetaConfig
 from hypogoal.meta.networks import CategoricalHead, GaussianHead, LightMetaNetwork, PaperMetaNetwork, among
 from hypogoal.meta.ppo import HEALTH, Draws, MetaPolicy, changes, clipped_surrogate
 from hypogoal.meta.smdp import explained_variance, scaled_advantages, smdp_advantages
@@ -179,7 +179,7 @@ def test_where_nothing_is_to_be_gained_choices_become_less_certain(head: str, mo
 
 def test_the_papers_network_sees_pictures_only() -> None:
     """Refused before training, in a line that names the setting."""
-    config = MetaConfig.of(meta_network="paper")
+    config = TrainMetaConfig.of(chooser="ppo", meta_network="paper")
     engine = Corridor(1)
     MetaPolicy.refuse(config, engine)
     engine.observation_dtype = "float32"
