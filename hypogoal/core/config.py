@@ -195,8 +195,8 @@ def integers(text: str) -> list[int]:
     """Parse integers: ``0-3,7`` becomes ``[0, 1, 2, 3, 7]``. Raises ``UserError`` for anything else."""
     try:
         return _items(text, int)
-    except ValueError:
-        raise UserError("not integers", repr(text[:200]), "Write them as 0-3,7.") from None
+    except ValueError as error:
+        raise UserError(str(error), repr(text[:200]), "Write them as 0-3,7.") from None
 
 
 def resolve(model: type[C], *layers: Values, stage: str) -> C:
@@ -283,8 +283,11 @@ def _items(text: str, kind: Any) -> list[Any]:
     numbers: list[int] = []
     for part in parts:
         start, dash, end = part.partition("-")
-        first = int(start)
-        last = int(end) if dash else first
+        try:
+            first = int(start)
+            last = int(end) if dash else first
+        except ValueError:
+            raise ValueError("not integers") from None
         if not first <= last < first + MOST:
             raise ValueError(f"a range goes up, over at most {MOST} integers")
         numbers += range(first, last + 1)

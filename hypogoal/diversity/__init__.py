@@ -65,7 +65,7 @@ class Objective:
     def acts(self, members: int) -> bool:
         """Return whether the objective has an effect on an ensemble of ``members`` members.
 
-        An objective of pairs needs two members.
+        A ``pair_loss`` needs two members. An ``ensemble_loss`` is called with one member, too.
         """
         return self.name != "none" and (members > 1 or self.ensemble_loss is not None)
 

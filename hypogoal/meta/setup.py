@@ -26,7 +26,8 @@ class Setup:
 
     Attributes:
         domain: where options are played.
-        source: the configuration of the ensemble. For another classifier, the settings that an ensemble has, too.
+        source: the configuration of the ensemble, which also says what options there are: K of each of its sub-goals.
+            For another classifier, the settings that an ensemble has, too.
         folder: the folder of the ensemble.
         config: the settings of the option policies, of the policy over options, and of the world.
         seed: the seed of weights, exploration and choices, and of layouts and start states if there are several.

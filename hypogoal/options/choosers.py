@@ -72,7 +72,7 @@ class Chooser(Part, ABC):
         """Choose an option for each of n environments, int64 (n,).
 
         ``environments`` are the numbers of the environments, and ``ids`` are their states. Only options may be chosen
-        for which ``offered``, bool (n, O), is true.
+        for which ``offered``, bool (n, O), is true. For ``symbols``, ``offered`` is also what it knows of the state.
         """
 
     def record(self, outcome: Outcome) -> None:

@@ -110,6 +110,8 @@ def test_what_is_no_assignment_or_no_list_is_refused() -> None:
             assigned([text])
     with pytest.raises(UserError, match=r"not integers: '3-'. Write them as 0-3,7\."):
         integers("3-")
+    with pytest.raises(UserError, match=r"a range goes up, over at most 10000 integers: '9-3'\."):
+        integers("9-3")
 
 
 def test_later_layers_win_and_none_is_not_given() -> None:
