@@ -10,7 +10,7 @@ View, network and Table 1 are the paper's, but K = 3, and 40,000 steps an option
 the paper's twelve without those whose tops are bases. Ensembles train for the steps with the highest balanced accuracy
 of the best member over all rooms (D-BAT 25, no diversity 1,000, CNN 50). The unit is the ensemble, so
 a seed: its ladders are six looks at the same members.
-Commits f88cd87 to 5bdde7c; 2.5 core hours.
+Commits f88cd87 to 5bdde7c, 2.5 core hours; seeds 12 to 16 at N = 1: 033b90a9 and 77a9bdec, 5 core hours.
 """
 
 from __future__ import annotations

@@ -112,7 +112,8 @@ def of_options(found: Found) -> None:
     stops = best.groupby(["method", "seed"]).mean()
     for other in ("none", "cnn"):
         apart = stops.loc[other] - stops.loc["dbat"]
-        found[f"stop-{other}"], found[f"true-{other}"] = apart["distance"].agg(ENDS), apart["stop_distance"].mean()
+        compare(found, f"stop-{other}", apart["distance"], median)
+        found[f"true-{other}"] = median(-apart["stop_distance"].dropna())  # how much farther D-BAT is
     found["at-base"] = cells("figure5-ladders", fate=2, method="none").groupby("seed")["count"].sum().max()
     means = cells("options-that-hold").groupby(["method", "seed", "ladder"], sort=False)["distance"].mean()
     found["ends"] = means["holds-dbat"].unstack().drop(columns=["0-4", "5-11", "7-13"]).dropna().mean(axis=1).agg(ENDS)
