@@ -11,8 +11,8 @@ from minigrid.wrappers import RGBImgObsWrapper
 from hypogoal.core.progress import Progress
 from hypogoal.data import Collected
 from hypogoal.domains.doorkey.domain import DOMAIN, DoorKeyConfig, _make_grid
-from hypogoal.domains.doorkey.engine import DROP, FORWARD, LEFT, PICKUP, TOGGLE
 from hypogoal.domains.doorkey.env import SUB_GOALS, DoorKeyEnv, DoorKeyGrid, make_layout
+from hypogoal.domains.doorkey.rules import DROP, FORWARD, LEFT, PICKUP, TOGGLE
 
 SAME_GRID = (90, 103)  # layout seeds whose grids are the same
 

@@ -9,8 +9,9 @@ import pytest
 from minigrid.core.world_object import Key
 from numpy.typing import NDArray
 
-from hypogoal.domains.doorkey.engine import DROP, FORWARD, N_ACTIONS, PICKUP, START, TOGGLE, DoorKeyEngine
+from hypogoal.domains.doorkey.engine import START, DoorKeyEngine
 from hypogoal.domains.doorkey.env import DOOR_LABELS, SUB_GOALS, DoorKeyEnv, GridLayout
+from hypogoal.domains.doorkey.rules import DROP, FORWARD, N_ACTIONS, PICKUP, TOGGLE
 
 LAYOUTS = range(100, 120)
 STEPS = 110

@@ -16,7 +16,9 @@ from PIL import Image
 from toy_data import files_of, reseal
 
 from hypogoal.core.artefacts import open_artefact
-from hypogoal.domains.doorkey.engine import KEY, TILE, DoorKeyEngine, tiles
+from hypogoal.domains.doorkey.engine import DoorKeyEngine
+from hypogoal.domains.doorkey.rules import KEY, tiles
+from hypogoal.domains.tiles import TILE
 from hypogoal.evaluation.page import lines_of
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.tools.audit_played import CELL, FILMS

@@ -9,94 +9,24 @@ change the configuration. Such changes are rare, so plain Python computes them. 
 """
 
 from collections.abc import Mapping, Sequence
-from functools import cache
-from itertools import product
 from typing import Any
 
 import numpy as np
-from minigrid.core.actions import Actions
-from minigrid.core.world_object import Door, Goal, Key, Wall
 from numpy.random import Generator
 
-from hypogoal.core.arrays import Array, Bools, Bytes, Ints
+from hypogoal.core.arrays import Bools, Bytes, Ints
 from hypogoal.domains.base import Engine, Layouts, Plan, Step
-from hypogoal.domains.doorkey.env import (
-    DOOR_COLOUR,
-    KEY_COLOURS,
-    MAX_STEPS,
-    OBSERVATION_SHAPE,
-    SIZE,
-    judge_sub_goals,
-    make_layout,
-)
-from hypogoal.domains.tiles import TILE, draw_tiles
+from hypogoal.domains.doorkey import rules
+from hypogoal.domains.doorkey.env import MAX_STEPS, OBSERVATION_SHAPE, SIZE, judge_sub_goals, make_layout
+from hypogoal.domains.doorkey.search import search
+from hypogoal.domains.doorkey.strips import UNKNOWN, Strips, lengthen
 
-N_ACTIONS = len(Actions)
-LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = map(int, Actions)
-SEARCHED = np.delete(np.arange(N_ACTIONS), DROP)  # the actions tried in the search for reachable states
-CELLS = SIZE * SIZE
-POSES = CELLS * 4  # pose = cell * 4 + direction; a power of two
-HELD = CELLS  # a key's place is its cell, or HELD + its rank on the ring, where rank 0 was picked up first
-KEY_BITS = np.array([1, 2, 4])  # of the blue, the green and the red key
-OPEN, CLOSED, LOCKED = 0, 1, 2  # MiniGrid's numbers for a door
 START = 0  # the id of the start state; with several layouts, of the start state of the first layout played
-UNKNOWN = -1
-
-# One byte per cell encodes its picture.
-EMPTY, WALL, GOAL = 0, 1, 2
-KEY = 3  # plus 0, 1, 2: blue, green, red
-DOOR = 6  # plus OPEN, CLOSED, LOCKED
-AGENT = 9  # plus the direction; plus 0, 4, 8: on the floor, in the open door, on the goal
-N_CODES = AGENT + 12
-AGENT_ON = np.zeros(N_CODES, np.uint8)
-AGENT_ON[EMPTY] = AGENT  # plus the direction
-AGENT_ON[DOOR + OPEN] = AGENT + 4
-AGENT_ON[GOAL] = AGENT + 8
-
-# MiniGrid's rules as tables. They are read flat, because one index into a table is several times faster than two.
-_POSE = np.arange(POSES)
-_CELL, _DIRECTION = np.divmod(_POSE, 4)
-_ONE_ON = np.array((1, SIZE, -1, -SIZE))  # what to add to a cell to get the next cell, by direction
-AHEAD = np.clip(_CELL + _ONE_ON[_DIRECTION], 0, CELLS - 1)  # the cell in front of each pose
-# MOVES is what to add to the pose, by action, code ahead and pose. MAY_CHANGE is whether the configuration may change.
-MOVES = np.zeros((N_ACTIONS, N_CODES, POSES), int)
-MOVES[LEFT] = (_DIRECTION - 1) % 4 - _DIRECTION
-MOVES[RIGHT] = (_DIRECTION + 1) % 4 - _DIRECTION
-MOVES[FORWARD, [EMPTY, GOAL, DOOR + OPEN]] = (AHEAD - _CELL) * 4
-MAY_CHANGE = np.zeros((N_ACTIONS, N_CODES), bool)
-MAY_CHANGE[PICKUP, KEY : KEY + 3] = True
-MAY_CHANGE[DROP, EMPTY] = True
-MAY_CHANGE[TOGGLE, DOOR : DOOR + 3] = True
-STRIP = SIZE * TILE * TILE * 3  # bytes of a strip, which is a row of cells in an image
 # The engine's tables that grow. They have a row for each state, or for each configuration.
-PER_STATE = (
-    "_site",
-    "_ahead",
-    "_codes",
-    "_strips",
-    "_on_goal",
-    "_final",
-)
-PER_CONFIGURATION = (
-    "_configurations",
-    "_bare_codes",
-    "_id_at",
-)
+PER_STATE = ("_site", "_ahead", "_codes", "_on_goal", "_final")
+PER_CONFIGURATION = ("_configurations", "_bare_codes", "_id_at")
 
 Configuration = tuple[int, ...]  # the layout's seed, the door, and the places of the blue, the green and the red key
-
-
-@cache
-def tiles() -> Bytes:
-    """Draw MiniGrid's picture of each cell code, uint8 (N_CODES, 8, 8, 3)."""
-    goal, open_door = Goal(), Door(DOOR_COLOUR, is_open=True)
-    keys = [Key(colour) for colour in KEY_COLOURS]
-    doors = [open_door, Door(DOOR_COLOUR), Door(DOOR_COLOUR, is_locked=True)]
-    objects = [None, Wall(), goal, *keys, *doors]
-    with_agent = product((None, open_door, goal), range(4))
-    table = draw_tiles([*product(objects, [None]), *with_agent])
-    table.flags.writeable = False
-    return table
 
 
 class DoorKeyEngine(Engine):
@@ -106,7 +36,7 @@ class DoorKeyEngine(Engine):
     seed or the layouts to begin episodes in.
     """
 
-    n_actions = N_ACTIONS
+    n_actions = rules.N_ACTIONS
     observation_shape = OBSERVATION_SHAPE
     restarts = resumes = True
     n_states = 0
@@ -127,23 +57,21 @@ class DoorKeyEngine(Engine):
         self._numbers: dict[Configuration, int] = {}
         # Rows by configuration: the configuration itself, its cell codes without the agent, and ids by pose.
         self._configurations = np.zeros((16, 5), int)
-        self._bare_codes = np.zeros((16, CELLS), np.uint8)
-        self._id_at = np.full((16, POSES), UNKNOWN, int)
-        # Rows by id: configuration * POSES + pose, the index of the cell ahead in the bare codes, the cell codes, the
-        # strips of the image once it was asked for, whether the agent is on the goal, and whether the episode ends.
+        self._bare_codes = np.zeros((16, rules.CELLS), np.uint8)
+        self._id_at = np.full((16, rules.POSES), UNKNOWN, int)
+        # Rows by id: configuration * rules.POSES + pose, the index of the cell ahead in the bare codes, the cell codes,
+        # whether the agent is on the goal, and whether the episode ends.
         self._site = np.zeros(256, int)
         self._ahead = np.zeros(256, int)
-        self._codes = np.zeros((256, CELLS), np.uint8)
-        self._strips = np.full((256, SIZE), UNKNOWN)
+        self._codes = np.zeros((256, rules.CELLS), np.uint8)
         self._on_goal = np.zeros(256, bool)
         self._final = np.zeros(256, bool)
-        self._drawn = np.zeros((256, STRIP), np.uint8)
-        self._strip_of: dict[int, int] = {}  # the number of a strip, by its eight cell codes as one number
+        self._strips = Strips(self.codes, len(self._site))
         self.reset()
 
     @property
     def tiles(self) -> Bytes:
-        return tiles()
+        return rules.tiles()
 
     def _begin(self, number: int) -> int:
         seed = self.layouts.begin(number)
@@ -152,9 +80,9 @@ class DoorKeyEngine(Engine):
     def _find_start(self, seed: int) -> int:
         """Return the start state of a layout."""
         layout = make_layout(seed)
-        configuration = self._enter_configuration((seed, LOCKED, *layout.keys))
+        configuration = self._enter_configuration((seed, rules.LOCKED, *layout.keys))
         pose = layout.start * 4 + layout.direction
-        return self._enter_state(configuration * POSES + pose)
+        return self._enter_state(configuration * rules.POSES + pose)
 
     def _find_starts(self, seeds: Sequence[int]) -> Ints:
         return np.array([self._find_start(seed) for seed in seeds])
@@ -172,16 +100,16 @@ class DoorKeyEngine(Engine):
     def follow(self, ids: Ints, actions: Ints) -> Ints:
         """Return the next states, int64 (n,), by MiniGrid's rules, after actions, int (n,) of 0 .. 6."""
         site = self._site.take(ids)
-        pose = site & (POSES - 1)
+        pose = site & (rules.POSES - 1)
         ahead = self._ahead.take(ids)
         code_ahead = self._bare_codes.ravel().take(ahead)
-        case = np.asarray(actions, int) * N_CODES + code_ahead
-        following_site = site + MOVES.take(case * POSES + pose)
-        [changing] = MAY_CHANGE.take(case).nonzero()
+        case = np.asarray(actions, int) * rules.N_CODES + code_ahead
+        following_site = site + rules.MOVES.take(case * rules.POSES + pose)
+        [changing] = rules.MAY_CHANGE.take(case).nonzero()
         for index in changing.tolist():
             action = int(actions[index])
             changed = self._change(site.item(index), action)
-            following_site[index] = changed * POSES + pose.item(index)
+            following_site[index] = changed * rules.POSES + pose.item(index)
         following = self._id_at.ravel().take(following_site)
         [new] = (following < 0).nonzero()
         for index in new.tolist():
@@ -190,46 +118,26 @@ class DoorKeyEngine(Engine):
 
     def _change(self, site: int, action: int) -> int:
         """Return the configuration after an action that ``MAY_CHANGE`` it, so a pickup, a drop or a toggle."""
-        configuration, pose = divmod(site, POSES)
+        configuration, pose = divmod(site, rules.POSES)
         seed, door, *keys = self._configurations[configuration].tolist()
         last = max(keys)
-        if action == DROP and last < HELD:  # no key is held, as at most drops of a random policy
+        if action == rules.DROP and last < rules.HELD:  # no key is held, as at most drops of a random policy
             return configuration
-        front = AHEAD.item(pose)
-        has_red_key = keys[-1] >= HELD
-        if action == PICKUP:
-            keys[keys.index(front)] = max(HELD, last + 1)
-        elif action == DROP:
+        front = rules.AHEAD.item(pose)
+        has_red_key = keys[-1] >= rules.HELD
+        if action == rules.PICKUP:
+            keys[keys.index(front)] = max(rules.HELD, last + 1)
+        elif action == rules.DROP:
             keys[keys.index(last)] = front
-        elif action == TOGGLE:
-            if door == OPEN:
-                door = CLOSED
-            elif door == CLOSED or has_red_key:  # once unlocked it never locks again
-                door = OPEN
+        elif action == rules.TOGGLE:
+            if door == rules.OPEN:
+                door = rules.CLOSED
+            elif door == rules.CLOSED or has_red_key:  # once unlocked it never locks again
+                door = rules.OPEN
         return self._enter_configuration((seed, door, *keys))
 
     def images(self, ids: Ints) -> Bytes:
-        strips = self._strips.take(ids, axis=0)
-        undrawn = strips[:, 0] == UNKNOWN
-        if undrawn.any():
-            self._draw(np.unique(ids[undrawn]))
-            strips = self._strips.take(ids, axis=0)
-        rows = self._drawn.take(strips, axis=0)
-        return rows.reshape(-1, *OBSERVATION_SHAPE)
-
-    def _draw(self, ids: Ints) -> None:
-        """Find the strips of states, and draw those strips that were not drawn yet."""
-        codes = self.codes(ids).reshape(-1, SIZE)
-        keys = codes.view(np.uint64)[:, 0]
-        for row, key in enumerate(keys.tolist()):
-            if key not in self._strip_of:
-                strip = self._strip_of[key] = len(self._strip_of)
-                if strip == len(self._drawn):
-                    self._drawn = lengthen(self._drawn)
-                cells = tiles()[codes[row]]  # (cell, y, x, colour)
-                self._drawn[strip] = cells.swapaxes(0, 1).ravel()
-            state, place = divmod(row, SIZE)
-            self._strips[ids[state], place] = self._strip_of[key]
+        return self._strips.images(ids)
 
     def codes(self, ids: Ints) -> Bytes:
         """Return each state's cell codes, uint8 (n, 64), row by row. With ``tiles()`` they give the whole image."""
@@ -241,11 +149,11 @@ class DoorKeyEngine(Engine):
 
     def labels(self, ids: Ints) -> Bools:
         """Return whether each sub-goal truly holds, bool (n, G), in the order of ``SUB_GOALS``."""
-        configurations = self._configurations[self._site.take(ids) // POSES]
-        door_open = configurations[:, 1] == OPEN
-        held = configurations[:, 2:] >= HELD
+        configurations = self._configurations[self._site.take(ids) // rules.POSES]
+        door_open = configurations[:, 1] == rules.OPEN
+        held = configurations[:, 2:] >= rules.HELD
         ahead = self._ahead.take(ids)
-        facing_door = self._bare_codes.ravel().take(ahead) >= DOOR
+        facing_door = self._bare_codes.ravel().take(ahead) >= rules.DOOR
         return judge_sub_goals(
             held,
             door_open,
@@ -260,7 +168,7 @@ class DoorKeyEngine(Engine):
         ``door_state`` is MiniGrid's (0 open, 1 closed, 2 locked). ``keys_held`` has bit 0 for the blue key, bit 1 for
         the green key, and bit 2 for the red key.
         """
-        number, pose = np.divmod(self._site.take(ids), POSES)
+        number, pose = np.divmod(self._site.take(ids), rules.POSES)
         cell, direction = np.divmod(pose, 4)
         configurations = self._configurations[number]
         return {
@@ -268,40 +176,16 @@ class DoorKeyEngine(Engine):
             "agent_y": cell // SIZE,
             "direction": direction,
             "door_state": configurations[:, 1],
-            "keys_held": (configurations[:, 2:] >= HELD) @ KEY_BITS,
+            "keys_held": (configurations[:, 2:] >= rules.HELD) @ rules.KEY_BITS,
         }
 
+    def is_final(self, ids: Ints) -> Bools:
+        """Return whether the episode ends in states, bool (n,)."""
+        return self._final.take(ids)
+
     def search(self, starts: Ints | None = None) -> tuple[Ints, Ints, Ints]:
-        """Search breadth-first for all states reachable from ``starts``, ids (n,), by default those of all layouts.
-
-        Returns the states' ids, nearest first, int64 (N,); the steps to each state, int64 (N,); and the states after
-        each action of ``SEARCHED``, int64 (N, A).
-
-        The search stops at states in which the episode ends, and every action is taken to lead back to such a state.
-        The search never drops a key, which leaves a few thousand states per layout instead of some ten million.
-        """
-        if starts is None:
-            starts = self._find_starts(self.layouts.seeds)
-        frontier = starts
-        rings: list[Ints] = []
-        ways: list[Ints] = []
-        seen = np.zeros(self.n_states, bool)
-        seen[starts] = True
-        while len(frontier):
-            going_on = ~self._final[frontier]
-            following = np.repeat(frontier[:, None], len(SEARCHED), axis=1)
-            origin = following[going_on]
-            actions = np.broadcast_to(SEARCHED, origin.shape)
-            reached = self.follow(origin.ravel(), actions.ravel())
-            following[going_on] = reached.reshape(origin.shape)
-            rings.append(frontier)
-            ways.append(following)
-            seen.resize(self.n_states, refcheck=False)  # new states get False
-            nearest = np.unique(reached)
-            frontier = nearest[~seen[nearest]]
-            seen[frontier] = True
-        steps = np.repeat(np.arange(len(rings)), [*map(len, rings)])
-        return np.concatenate(rings), steps, np.concatenate(ways)
+        """Search from ``starts``, ids (n,), by default those of all layouts, as :func:`.search.search` says."""
+        return search(self, self._find_starts(self.layouts.seeds) if starts is None else starts)
 
     def reachable(self) -> Ints:
         """Return the ids of all states reachable from the start, nearest first, one for each image.
@@ -310,7 +194,7 @@ class DoorKeyEngine(Engine):
         """
         ids, *_ = self.search()
         codes = self.codes(ids)
-        looks = codes.view(f"V{CELLS}")[:, 0]
+        looks = codes.view(f"V{rules.CELLS}")[:, 0]
         _, first = np.unique(looks, return_index=True)
         return ids[np.sort(first)]
 
@@ -319,9 +203,9 @@ class DoorKeyEngine(Engine):
         ids, _, following = self.search(starts)
         return Plan(
             ids,
-            SEARCHED,
+            rules.SEARCHED,
             following,
-            final=self._final[ids],
+            final=self.is_final(ids),
             solved=self.at_goal(ids),
         )
 
@@ -343,7 +227,7 @@ class DoorKeyEngine(Engine):
         ids = self._find_starts(seeds.tolist())
         solved = 0
         for _ in range(self.max_steps):
-            actions = rng.integers(N_ACTIONS, size=len(ids))
+            actions = rng.integers(rules.N_ACTIONS, size=len(ids))
             ids = self.follow(ids, actions)
             solved += int(self.at_goal(ids).sum())
             ids = ids[~self._final[ids]]
@@ -373,18 +257,19 @@ class DoorKeyEngine(Engine):
         new = self.n_states
         if new == len(self._site):
             self._double(PER_STATE)
-        configuration, pose = divmod(site, POSES)
+            self._strips.make_room()
+        configuration, pose = divmod(site, rules.POSES)
         cell, direction = divmod(pose, 4)
         codes = self._codes[new]
         codes[:] = self._bare_codes[configuration]
         under = codes.item(cell)
-        codes[cell] = AGENT_ON.item(under) + direction
+        codes[cell] = rules.AGENT_ON.item(under) + direction
         self._site[new] = site
-        self._ahead[new] = configuration * CELLS + AHEAD.item(pose)
+        self._ahead[new] = configuration * rules.CELLS + rules.AHEAD.item(pose)
         _, _, blue, green, _ = self._configurations[configuration].tolist()
-        at_goal = under == GOAL
+        at_goal = under == rules.GOAL
         self._on_goal[new] = at_goal
-        is_wrong = self.harsh and max(blue, green) >= HELD
+        is_wrong = self.harsh and max(blue, green) >= rules.HELD
         self._final[new] = at_goal or is_wrong
         self._id_at[configuration, pose] = new
         self.n_states += 1
@@ -400,14 +285,14 @@ class DoorKeyEngine(Engine):
             self._double(PER_CONFIGURATION)
         seed, door, *keys = configuration
         layout = make_layout(seed)
-        row = bytearray(CELLS)  # because an array is slower
+        row = bytearray(rules.CELLS)  # because an array is slower
         for cell in layout.walls:
-            row[cell] = WALL
-        row[layout.goal] = GOAL
-        row[layout.door] = DOOR + door
+            row[cell] = rules.WALL
+        row[layout.goal] = rules.GOAL
+        row[layout.door] = rules.DOOR + door
         for colour, place in enumerate(keys):
-            if place < HELD:
-                row[place] = KEY + colour
+            if place < rules.HELD:
+                row[place] = rules.KEY + colour
         self._configurations[new] = configuration
         self._bare_codes[new] = np.frombuffer(row, np.uint8)
         return new
@@ -416,9 +301,3 @@ class DoorKeyEngine(Engine):
         """Double the number of rows of the tables ``names``."""
         for name in names:
             setattr(self, name, lengthen(getattr(self, name)))
-
-
-def lengthen(table: Array) -> Array:
-    """Return the table with twice as many rows. Integers in new rows are ``UNKNOWN``, and other values are 0."""
-    filling = UNKNOWN if table.dtype == int else 0
-    return np.concatenate([table, np.full_like(table, filling)])
