@@ -229,13 +229,3 @@ def test_snapshots_are_exact() -> None:
         assert all(np.array_equal(a, b) for a, b in zip(played(resumed, actions[begin:end]), expected, strict=True))
         everything = np.arange(unbroken.n_states)
         assert np.array_equal(resumed.positions(everything), unbroken.positions(everything))
-
-
-def test_threads_change_no_byte(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Games played one after the other, and side by side."""
-    actions = busy(np.random.default_rng(5), (40, 3))
-    said = []
-    for threads in (1, 3):
-        monkeypatch.setattr("hypogoal.domains.montezuma.engine.cores", lambda threads=threads: threads)
-        said.append(played(MontezumaEngine("1L", 3, start_states=STARTS, max_steps=25, memory=90), actions))
-    assert all(np.array_equal(one, other) for one, other in zip(*said, strict=True))

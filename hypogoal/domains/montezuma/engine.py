@@ -4,7 +4,6 @@ An observation is four frames, of 7 kB each. Each step adds one frame, so states
 """
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from operator import itemgetter
 from typing import Any
@@ -13,9 +12,7 @@ import numpy as np
 
 from hypogoal.core.arrays import Bools, Ints
 from hypogoal.core.errors import UserError
-from hypogoal.core.processes import cores
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.base import Step
 from hypogoal.domains.montezuma import emulator as game
 from hypogoal.domains.montezuma.env import MAX_STEPS, START_STATES, make_starts
 from hypogoal.domains.montezuma.sub_goals import SUB_GOALS, judge_sub_goals
@@ -58,8 +55,6 @@ class MontezumaEngine(TurnEngine):
         self.count, self.max_steps = count, max_steps
         self.memory = self.room = memory
         self._emulators = [game.Emulator() for _ in range(count)]
-        self._threads = ThreadPoolExecutor(min(cores(), count))  # while an emulator plays, other threads run
-        self._rewards: list[float] = []  # the rewards of the step that is being played
         emulator = self._emulators[0]
         self.starts = make_starts(emulator, start, start_states, seed)
         self._rng = rng_for(seed, "start-of-episode")
@@ -73,13 +68,9 @@ class MontezumaEngine(TurnEngine):
         self._emulators[number].restore(self.starts[begin])
         return begin
 
-    def step(self, actions: Ints) -> Step:
-        rewards = self._threads.map(game.Emulator.step, self._emulators, actions.tolist())
-        self._rewards = [*rewards]
-        return super().step(actions)
-
     def _play(self, number: int, action: int, elapsed: int) -> tuple[Any, ...]:
-        emulator, reward = self._emulators[number], self._rewards[number]
+        emulator = self._emulators[number]
+        reward = emulator.step(action)
         facts = emulator.facts()
         state = self._add(emulator.seen, facts.tobytes())
         terminated = bool(facts[game.DYING])
