@@ -80,7 +80,7 @@ def tables(path: Path) -> Iterator[str]:
             at_base = f"{(stops[:, 3] == HIT).mean():.2f}"
             inside = f"{(stops[:, 3] == BEGAN_INSIDE).mean():.2f}"
             rows.append([title, str(seed), at_base, inside, f"{spread(stops):.1f}"])
-    yield from table(["members", "seed", "ended at a base", "began at an own yes", "spread, units"], rows)
+    yield from table(["members", "seed", "ended at a base", "positive starts", "spread, units"], rows)
 
 
 def draw(path: Path, seed: int, picture: Path) -> None:

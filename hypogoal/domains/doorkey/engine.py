@@ -185,7 +185,9 @@ class DoorKeyEngine(Engine):
 
     def search(self, starts: Ints | None = None) -> tuple[Ints, Ints, Ints]:
         """Search from ``starts``, ids (n,), by default those of all layouts, as :func:`.search.search` says."""
-        return search(self, self._find_starts(self.layouts.seeds) if starts is None else starts)
+        if starts is None:
+            starts = self._find_starts(self.layouts.seeds)
+        return search(self, starts)
 
     def reachable(self) -> Ints:
         """Return the ids of all states reachable from the start, nearest first, one for each image.
