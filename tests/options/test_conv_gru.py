@@ -16,7 +16,7 @@ from hypogoal.domains.doorkey.engine import DoorKeyEngine
 from hypogoal.options import double_dqn
 from hypogoal.options.conv_gru import Lived, PaperPolicies
 from hypogoal.options.loop import OptionLoop
-from hypogoal.options.paper_network import PaperQNetwork
+from hypogoal.options.paper_network import PaperQNetwork, ProductsOfPlaces
 from hypogoal.options.saved import SavedOptions
 
 STAY = 0
@@ -88,6 +88,20 @@ def test_distinct_patches_give_what_whole_images_give(training: bool) -> None:
             assert (same.grad - weight.grad).norm() <= 1e-4 * scale, name
     for one, two in zip(plain.buffers(), tabled.buffers(), strict=True):
         torch.testing.assert_close(two.to(one.dtype), one, rtol=0, atol=1e-6)
+
+
+def test_products_of_places_are_those_of_a_loop() -> None:
+    """Products and gradients are the same bytes as by PyTorch's own gradient of the loop over places."""
+    torch.manual_seed(0)
+    counts = [3, 1, 5]
+    contents, looks = torch.randn(9, 4, requires_grad=True), torch.randn(3, 4, 6, requires_grad=True)
+    wanted = torch.randn(9, 6)
+    products = ProductsOfPlaces.apply(contents, looks, counts)
+    found = torch.autograd.grad((products * wanted).sum(), [contents, looks])
+    plain = torch.cat([rows @ weight for rows, weight in zip(contents.split(counts), looks, strict=True)])
+    expected = torch.autograd.grad((plain * wanted).sum(), [contents, looks])
+    assert torch.equal(products, plain)
+    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
 
 
 def test_the_papers_sizes() -> None:
