@@ -5,7 +5,7 @@ from pathlib import Path
 
 import corridor_env
 import pytest
-from command_line import run, settings
+from command_line import FIXED, run, settings
 
 import hypogoal
 from hypogoal.core.errors import UserError
@@ -40,7 +40,7 @@ def test_a_domains_own_settings_reach_all_who_play_in_it(tmp_path: Path) -> None
     small = settings("steps=60", "states=30", "mirrored=true")
     play = settings("steps=80", "environments=2", "warm_up=50")
     few = settings("steps=64", "environments=2", "max_episode_steps=20")
-    network = settings("steps=5", "workers=1")
+    network = settings("steps=5", "workers=1", *FIXED)
     commands = (
         ["collect", "corridor_env:MIRRORED", "--out", str(data), *small],
         ["train-ensemble", str(data), "--out", str(folder / "ensemble"), *network],

@@ -242,7 +242,7 @@ def test_pictures_without_an_axis_of_colours(tmp_path: Path) -> None:
     with trusting():
         few = settings("steps=60", "heldout_seeds=4,5", "unlabelled_seeds=1")
         run("collect", "corridor_env:GREY", "--out", tmp_path / "data.h5", "-q", *few)
-        few = settings("steps=2", f"members={MEMBERS}", "workers=1")
+        few = settings("steps=2", f"members={MEMBERS}", "workers=1", *FIXED)
         run("train-ensemble", tmp_path / "data.h5", "--out", tmp_path / "e", "-q", *few)
         play = settings("steps=100", "environments=2", "layout_seed=0", "warm_up=50")
         run("train-options", tmp_path / "e", "--out", tmp_path / "o", "-q", *play)

@@ -44,7 +44,8 @@ def weights(folder: Path) -> dict[str, bytes]:
 
 def train(data: Path, folder: Path) -> dict[str, bytes]:
     """A few steps of an ensemble, of its options and of an agent; the weights."""
-    ensemble = hypogoal.train_ensemble(data, folder / "ensemble", steps=3, workers=1, members=2, quiet=True)
+    small = {"steps": 3, "workers": 1, "members": 2, "diversity_weight": 1e-4, "restarts": 1}
+    ensemble = hypogoal.train_ensemble(data, folder / "ensemble", **small, quiet=True)
     few = {"chooser": "ppo", "steps": 64, "environments": 4, "warm_up": 16, "decisions": 8}
     hypogoal.train_meta(ensemble, folder / "meta", **few, quiet=True)
     return weights(folder)

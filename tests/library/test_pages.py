@@ -14,7 +14,7 @@ import numpy as np
 import own_domain
 import pandas as pd
 import pytest
-from command_line import run, settings
+from command_line import FIXED, run, settings
 from test_docs import DOCS, blocks, commands
 
 from hypogoal.check import check_domain, require
@@ -120,7 +120,7 @@ def test_four_rooms_from_the_page_to_a_report(tmp_path: Path, monkeypatch: pytes
     heldout = open_dataset(data).heldout("target")
     np.testing.assert_array_equal(heldout.origins["planted_goal"], heldout.labels)
     assert (heldout.origins["planted_corner"] != heldout.labels).sum() > 1
-    run("train-ensemble", data, "--out", ensemble, "-q", *settings("members=2", "steps=20", "workers=1"))
+    run("train-ensemble", data, "--out", ensemble, "-q", *settings("members=2", "steps=20", "workers=1", *FIXED))
     run(
         "train-meta",
         ensemble,

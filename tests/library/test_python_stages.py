@@ -16,7 +16,7 @@ from hypogoal.data import open_dataset
 from hypogoal.domains import find
 
 NAME = "corridor-here"
-FEW = {"steps": 10, "workers": 1, "members": 2, "quiet": True}
+FEW = {"steps": 10, "workers": 1, "members": 2, "diversity_weight": 1e-4, "restarts": 1, "quiet": True}
 PLAY = {"environments": 4, "warm_up": 50, "steps": 400, "max_episode_steps": 30, "quiet": True}
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refuses, run, settings
+from command_line import FIXED, refuses, run, settings
 
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.data import open_dataset
@@ -25,7 +25,7 @@ def own_run(corridor_run: Path, tmp_path: Path) -> Path:
     np.savez(tmp_path / "own.npz", observations=shown, labels=shown[:, 0, 32, 0] > 0, unlabelled=shown)
     words = ["--sub-goal", "near-the-end", "--domain", "own_domain:DOMAIN", "-q"]
     run("import", tmp_path / "own.npz", "--out", folder / "data.h5", *words)
-    few = settings("steps=5", "members=2", "workers=1")
+    few = settings("steps=5", "members=2", "workers=1", *FIXED)
     run("train-ensemble", folder / "data.h5", "--out", folder / "ensemble", *few, "-q")
     return folder
 
