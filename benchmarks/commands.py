@@ -2,7 +2,8 @@
 
     python -m benchmarks.commands OTHER [--only start demo test] [--repeats N] [--json PATH]
 
-OTHER is a checkout of another version; ``make setup`` has run in both, and nothing else runs. ``start`` is one step of
+OTHER is a checkout of another version; ``make setup`` has run in both, and nothing else runs. Each must have a virtual
+environment of its own, because a linked one would run the same version twice. ``start`` is one step of
 ``train-meta`` in a room, CPU time; ``demo`` is ``make demo`` from nothing, wall time; ``test`` is ``make test``, CPU
 time (without what a fork server's children take).
 """
@@ -10,6 +11,7 @@ time (without what a fork server's children take).
 from __future__ import annotations
 
 import argparse
+import os
 import resource
 import subprocess
 import tempfile
@@ -22,7 +24,18 @@ from benchmarks import timing
 
 HERE = Path(__file__).parents[1]
 BEFORE = "which-feature"  # what 0.23 called the rooms
+# Without this, each process compiles all modules anew, which takes as long as everything else in a command's start.
+COMPILED = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 WANTED = {"start": 1 / 0.65, "demo": 1 / 0.40, "test": 1 / 0.35}
+
+
+def require_own(checkout: Path) -> None:
+    """End the program if the checkout's commands run the package of another checkout."""
+    ask = [str(checkout / ".venv/bin/python"), "-I", "-c", "import hypogoal; print(hypogoal.__file__)"]
+    told = subprocess.run(ask, capture_output=True, text=True, check=True)
+    place = Path(told.stdout.strip())
+    if checkout not in place.parents:
+        raise SystemExit(f"{checkout} runs {place.parent}: remove its .venv and run 'make setup' there")
 
 
 def timed(*words: object) -> tuple[float, float]:
@@ -30,7 +43,7 @@ def timed(*words: object) -> tuple[float, float]:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryFile("w+") as printed:  # a pipe would wait for what outlives the command
         begin = time.perf_counter()
-        done = subprocess.run([*map(str, words)], stdout=printed, stderr=subprocess.STDOUT, check=False)
+        done = subprocess.run([*map(str, words)], stdout=printed, stderr=subprocess.STDOUT, env=COMPILED, check=False)
         waited = time.perf_counter() - begin
         printed.seek(0)
         if done.returncode:
@@ -75,6 +88,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--json", type=Path, help="also write the figures here")
     given = parser.parse_args()
+    for checkout in (HERE, given.other.resolve()):
+        require_own(checkout)
     about = timing.machine()
     results = {}
     for name in given.only:
