@@ -1,11 +1,14 @@
 """Whole commands of this checkout and of another one's, in turn: what one waits for.
 
-    python -m benchmarks.commands OTHER [--only start demo test] [--repeats N] [--json PATH]
+    python -m benchmarks.commands OTHER [--only start report demo test] [--repeats N] [--json PATH]
 
 OTHER is a checkout of another version; ``make setup`` has run in both, and nothing else runs. Each must have a virtual
-environment of its own, because a linked one would run the same version twice. ``start`` is one step of
-``train-meta`` in a room, CPU time; ``demo`` is ``make demo`` from nothing, wall time; ``test`` is ``make test``, CPU
-time (without what a fork server's children take).
+environment of its own, because a linked one would run the same version twice. Wall time or, where it is said, CPU time:
+
+- ``start``: one step of ``train-meta`` in a room, CPU time;
+- ``report``: of the checkout's own ``runs/demo``, which ``make demo`` must have made, CPU time;
+- ``demo``: ``make demo`` from nothing;
+- ``test``: ``make test``, CPU time, without what a fork server's children take.
 """
 
 from __future__ import annotations
@@ -64,6 +67,14 @@ def start(checkout: Path) -> float:
     return seconds
 
 
+def report(checkout: Path) -> float:
+    """CPU seconds of the report of the run that ``make demo`` leaves in the checkout."""
+    with tempfile.TemporaryDirectory() as name:
+        page = Path(name, "report")
+        _waited, seconds = timed(checkout / ".venv/bin/hypogoal", "report", checkout / "runs/demo", "--out", page)
+    return seconds
+
+
 def demo(checkout: Path) -> float:
     """Seconds until both reports are there."""
     with tempfile.TemporaryDirectory() as name:
@@ -77,7 +88,7 @@ def test(checkout: Path) -> float:
     return seconds
 
 
-MEASURES: dict[str, Callable[[Path], float]] = {"start": start, "demo": demo, "test": test}
+MEASURES: dict[str, Callable[[Path], float]] = {"start": start, "report": report, "demo": demo, "test": test}
 
 
 def main() -> None:

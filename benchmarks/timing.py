@@ -65,7 +65,8 @@ def rows_of(found: Mapping[str, Sequence[float]], reference: str, wanted: Mappin
     for name, seconds in found.items():
         ratios = [slow / fast for slow, fast in zip(found[reference], seconds, strict=True)]
         row = {"name": name, "seconds": statistics.median(seconds), "lowest": min(seconds), "highest": max(seconds)}
-        rows.append({**row, "ratio": statistics.median(ratios), "wanted": wanted.get(name)})
+        row |= {"ratio": statistics.median(ratios), "ratios": ratios, "wanted": wanted.get(name)}
+        rows.append(row)
     return rows
 
 

@@ -19,8 +19,10 @@ from hypogoal.observations import PICTURE
 
 if TYPE_CHECKING:
     from hypogoal.meta.episodes import Frame
+    from hypogoal.options.loop import OptionLoop
 
 NEEDED = "Videos need a meta artefact with learned terminations: train-meta."
+KEPT = "film.gif"  # the film in an evaluation
 MOST_FRAMES = 200  # frames that are played at most to find an episode whose members differ
 SIDE = 336  # pixels to which a state is enlarged, or a little less
 LINE, MARGIN, BAR, FONT = 18, 8, 8, 13  # pixels below the state
@@ -33,9 +35,13 @@ FAINT = "#a2a9b2"  # readable on the ink of a film
 class Film:
     """A film of an agent's episode."""
 
-    name: str  # the name of the file
     gif: bytes
-    about: dict[str, Any]  # what the page says of the film
+    facts: dict[str, Any]  # what the page says of the film
+
+    @property
+    def name(self) -> str:
+        """The name of the film's file."""
+        return f"{self.facts['path'].replace('/', '-')}-episode-{self.facts['number']}.gif"
 
 
 def agent_to_film(run: Path) -> Artefact | None:
@@ -44,41 +50,63 @@ def agent_to_film(run: Path) -> Artefact | None:
     return agents[0] if agents else None
 
 
-def films_of(agent: Artefact, path: str, count: int | None) -> list[Film]:
-    """Return films of the first ``count`` episodes of an agent, named after ``path``, the agent's path in the run.
+def keep_film(run: Path, folder: Path) -> dict[str, Any] | None:
+    """Write into an evaluation's folder the film for the run's page, and return what the page says of the film.
 
-    With ``count`` None, there is one film, of the first episode that :func:`_telling` finds within ``MOST_FRAMES`` or,
-    if there is none, of the first episode. Raises ``UserError`` if the agent does not see pictures.
+    The film is of the first episode that :func:`_telling` finds. There is none, and None is returned, if the run has no
+    agent to film, or one that does not see pictures.
+    """
+    from hypogoal.meta.episodes import agent_of
+
+    agent = agent_to_film(run)
+    if agent is None:
+        return None
+    loop = agent_of(agent, seed=0)
+    if loop.engine.observation_dtype != PICTURE:
+        return None
+    number, frames = _telling(loop, agent.config["members"])
+    film = _film_of(agent, agent.path.relative_to(run).as_posix(), number, frames)
+    (folder / KEPT).write_bytes(film.gif)
+    return film.facts
+
+
+def kept_films(evaluation: Path, facts: dict[str, Any] | None) -> list[Film]:
+    """Return the film that :func:`keep_film` wrote into an evaluation's folder, if there is one."""
+    return [] if facts is None else [Film((evaluation / KEPT).read_bytes(), facts)]
+
+
+def films_of(agent: Artefact, path: str, count: int) -> list[Film]:
+    """Play the first ``count`` episodes of an agent, whose path in the run is ``path``, and return a film of each.
+
+    Raises ``UserError`` if the agent does not see pictures.
     """
     from hypogoal.meta.episodes import agent_of, play_episode
 
-    loop, config = agent_of(agent, seed=0), agent.config
+    loop = agent_of(agent, seed=0)
     if loop.engine.observation_dtype != PICTURE:
         raise UserError("videos need an agent that sees pictures", agent.path, "Leave --videos out.")
-    members = config["members"]
-    if count is None:
-        episodes = dict([_telling(loop, members)])
-    else:
-        episodes = {number: play_episode(loop, members) for number in range(count)}
-    films = []
-    for number, frames in episodes.items():
-        gif = episode_gif(frames, config["sub_goals"], members, config["option_timeout"])
-        facts = {
-            "path": path,
-            "number": number,
-            "steps": frames[-1].step,
-            "options": sum(bool(frame.ended) for frame in frames),
-            "layout": config["layout_seed"],
-            "members": members,
-        }
-        films.append(Film(f"{path.replace('/', '-')}-episode-{number}.gif", gif, facts))
-    return films
+    return [_film_of(agent, path, number, play_episode(loop, agent.config["members"])) for number in range(count)]
 
 
-def _telling(loop, members):
+def _film_of(agent: Artefact, path: str, number: int, frames: Sequence[Frame]) -> Film:
+    config = agent.config
+    gif = episode_gif(frames, config["sub_goals"], config["members"], config["option_timeout"])
+    facts = {
+        "path": path,
+        "number": number,
+        "steps": frames[-1].step,
+        "options": sum(bool(frame.ended) for frame in frames),
+        "layout": config["layout_seed"],
+        "members": config["members"],
+    }
+    return Film(gif, facts)
+
+
+def _telling(loop: OptionLoop, members: int) -> tuple[int, list[Frame]]:
     """Return the number and frames of the first episode in which members differed and the agent took the right one.
 
-    It took the right one if the episode was solved, and the last option's own member ended that option.
+    It took the right one if the episode was solved, and the last option's own member ended that option. If no such
+    episode begins within ``MOST_FRAMES``, it is the first episode.
     """
     from hypogoal.meta.episodes import SOLVED, play_episode
 

@@ -28,6 +28,7 @@ READERS = {
     "options-more/visited.h5": "train-ensemble {run}/data.h5 --unlabelled {run}/options-more --out {out}",
     "evaluation/run.json": "report {run} --force",
     "evaluation/arrays.h5": "report {run} --force",
+    "evaluation/film.gif": "report {run} --force",
     "own/preset.toml": "train-ensemble {run}/data.h5 --preset {run}/own/preset.toml --out {out}",
     "own/experiment.toml": "run {run}/own/experiment.toml --out {out} --dry-run",
     "own/arrays.npz": "import {run}/own/arrays.npz --out {out}",

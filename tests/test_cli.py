@@ -43,7 +43,7 @@ def test_what_was_made_otherwise_is_not_resumed(tiny_run: Path) -> None:
     refuses(f"{made_with} domain=doorkey, not montezuma", "collect", "montezuma", "--out", data, "--resume")
     refuses(f"{made_with} other inputs", *resumed(tiny_run, "ensemble", "--unlabelled", str(data)))
     refuses("not of kind 'baseline'", "train-baseline", "montezuma", "--out", tiny_run / "meta", "--resume")
-    refuses(f"{made_with} videos=1, not 2", "report", tiny_run, "--resume", "--videos", "2")
+    refuses(f"{made_with} videos=kept, not 2", "report", tiny_run, "--resume", "--videos", "2")
 
 
 def test_same_seed_same_bytes(corridor_run: Path, corridor_copy: Path, tmp_path: Path) -> None:

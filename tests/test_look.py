@@ -17,7 +17,8 @@ from hypogoal.look import describe, faults, lines, outcome, stale
 
 KINDS = ("ensemble", "options", "meta", "baseline", "evaluation", "report", "comparison", "audit")
 COMPARED = {"differences.csv", "curves.csv", "hypotheses.csv", "rooms.csv", "distance.csv"}
-MAY = {"executions.csv", "exploits.csv", *COMPARED}, ("figures/", "videos/", "tables/", "before-", "mended-")
+MAY_FILES = {"executions.csv", "exploits.csv", "film.gif", *COMPARED}
+MAY = MAY_FILES, ("figures/", "videos/", "tables/", "before-", "mended-")
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]
 def files_of(kind: str, config: Mapping[str, Any]) -> set[str]:
     """The files that a stage always writes, by its artefact's kind and settings, besides the manifest.
 
-    Others (figures, videos, ``executions.csv``, ``exploits.csv``) depend on what happened.
+    Others (figures, films, ``executions.csv``, ``exploits.csv``) depend on what happened.
     """
     if kind in ("options", "meta", "audit"):
         played = {LOG, "episodes.csv", "layout.json", "options.safetensors", "choices.csv", "terminations.h5"}

@@ -29,14 +29,15 @@ def evaluate(
     """Compute every number of a run, such as accuracies and choices.
 
     ``run`` is a folder with any ensemble, options, meta and baseline artefacts. ``out`` gets ``numbers.csv``, each
-    question's ``tables/*.csv``, ``run.json`` (what is missing, provenance) and ``arrays.h5``. If an experiment made the
-    run, ``out`` also gets ``results.csv``.
+    question's ``tables/*.csv``, ``run.json`` (what is missing, provenance) and ``arrays.h5``. If an agent chooses among
+    options and sees pictures, ``out`` also gets ``film.gif``, and if an experiment made the run, ``results.csv``.
     """
     from hypogoal.core.hdf5 import create_hdf5
     from hypogoal.core.processes import prepare
     from hypogoal.evaluation import questions
     from hypogoal.evaluation.judging import Work
     from hypogoal.evaluation.run import find
+    from hypogoal.films import keep_film
     from hypogoal.meta.config import layout_seeds
 
     prepare()
@@ -56,6 +57,7 @@ def evaluate(
             Progress("evaluate", total=parts, quiet=call.quiet) as progress,
         ):
             work = Work(contents, arrays, progress, played)
+            work.facts["film"] = keep_film(run, draft.files)
             results = questions.answer(work, settings)
         if left := cells.unmade(run):
             line = f"{len(left)} of the run's cells are not done; the first is {left[0]}"

@@ -12,7 +12,10 @@ from hypogoal.core.errors import UserError
 from hypogoal.core.progress import say
 
 MOST_BYTES = 2_000_000  # a larger film is not shown on the page
-FILMS = "How many films of the agent to write as videos/*.gif; the page shows one of them. Default: one, if possible."
+FILMS = (
+    "How many films of the agent to play and write as videos/*.gif; the page shows one of them. Default: only the one "
+    "that evaluate kept."
+)
 
 
 @stage("report runs/mine --videos 3", leaves_out=NO_SETTINGS, into="report")
@@ -27,7 +30,8 @@ def report(
     """Draw the report of an evaluated run as one HTML file.
 
     ``out`` gets the page ``index.html`` and ``figures/*.svg``. ``videos`` is how many episodes of the run's first agent
-    are filmed into ``videos/*.gif``. With ``figures``, a folder, only the paper's figures are drawn.
+    are played and filmed into ``videos/*.gif``. Without it, the film there is the evaluation's. With ``figures``, a
+    folder, only the paper's figures are drawn.
     """
     if figures is not None:
         from hypogoal.evaluation.figure_files import draw_figures
@@ -42,25 +46,21 @@ def report(
     from hypogoal.evaluation.page import source, write
     from hypogoal.evaluation.questions import answers, render
     from hypogoal.evaluation.run import evaluation_of, read_evaluation
-    from hypogoal.films import NEEDED, agent_to_film, films_of
+    from hypogoal.films import NEEDED, agent_to_film, films_of, kept_films
 
     evaluation = evaluation_of(run)
     agent = None if videos == 0 else agent_to_film(run)
     if agent is None and videos:
         raise UserError("no agent to make videos of", run, NEEDED)
     inputs = [evaluation.path] if agent is None else [evaluation.path, agent.path]
-    with call.draft("report", {"videos": len(inputs) - 1 if videos is None else videos}, inputs) as draft:
+    with call.draft("report", {"videos": "kept" if videos is None else videos}, inputs) as draft:
         results = read_evaluation(run)
-        films = []
-        try:
-            films = films_of(agent, agent.path.relative_to(run).as_posix(), videos) if agent else []
-        except UserError as error:
-            if videos:
-                raise
-            results.facts["missing"].append(f"no film of an episode: {error}")
+        films = kept_films(evaluation.path, results.facts["film"]) if videos is None else []
+        if agent and videos:
+            films = films_of(agent, agent.path.relative_to(run).as_posix(), videos)
         every = answers(results)
         small = [film for film in films[:1] if len(film.gif) <= MOST_BYTES]
-        shown = [film.about | {"source": source(film.gif, "gif")} for film in small]
+        shown = [film.facts | {"source": source(film.gif, "gif")} for film in small]
         page = render(results, every, shown)
         drawn = chain.from_iterable(each["figures"] for each in every)
         write(draft.files, page, drawn)

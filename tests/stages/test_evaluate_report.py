@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import tomllib
+from base64 import b64encode
 from pathlib import Path
 
 import matplotlib as mpl
@@ -188,15 +189,17 @@ def test_the_page_shows_all_of_it_each_time_the_same(tiny_run, tiny_copy):
 
 
 def test_what_changed_since_is_said(tiny_copy):
-    """Spec A5, E1, F7: what an evaluation does not know of; why there is no film, where somebody asked an error."""
+    """Spec A5, E1, F7: what an evaluation does not know of; its film needs no agent, others do."""
     (kept,) = (path for path in (tiny_copy / "report" / "videos").iterdir() if path.suffix == ".gif")
-    assert kept.name == "meta-episode-0.gif"
+    film = (tiny_copy / "evaluation" / "film.gif").read_bytes()
+    assert kept.name == "meta-episode-0.gif" and kept.read_bytes() == film
     assert not [line for line in read_evaluation(tiny_copy).facts["missing"] if "since" in line]
     reseal(shutil.copytree(tiny_copy / "ppo", tiny_copy / "later"), seed=1)
     (tiny_copy / "meta" / "options.safetensors").unlink()
     text = page_of(tiny_copy, force=True)
     assert "later: made since this evaluation" in text
-    assert "no film of an episode: " in text and "image/gif" not in text
+    assert b64encode(film).decode() in text
+    assert "image/gif" not in page_of(tiny_copy, videos=0, force=True)
     with pytest.raises(UserError, match=r"options\.safetensors"):
         report(tiny_copy, videos=1, force=True)
 

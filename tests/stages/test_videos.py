@@ -16,7 +16,7 @@ from PIL import Image
 from hypogoal.core.artefacts import open_artefact
 from hypogoal.core.errors import UserError
 from hypogoal.data import Collected, States, write_dataset
-from hypogoal.films import agent_to_film, draw_frame, episode_gif, films_of, frame_lines
+from hypogoal.films import agent_to_film, draw_frame, episode_gif, films_of, frame_lines, keep_film, kept_films
 from hypogoal.hypotheses.ensemble import read_ensemble
 from hypogoal.meta.episodes import Frame, agent_of, play_episode
 from hypogoal.tools.sheets import COLUMNS, GAP, MOST_STATES, sheet, sheets, write_sheets
@@ -73,7 +73,7 @@ def test_videos_are_of_the_agents_that_choose(tiny_run):
         assert video.size[0] == 320
 
 
-def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch):
+def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, tmp_path, monkeypatch):
     """Spec E1, F7: the first of a few that the right one of two members solves; where there is none, the first."""
     from hypogoal.meta import episodes
 
@@ -82,11 +82,10 @@ def test_the_film_of_a_page_is_one_in_which_members_differ(tiny_run, monkeypatch
     wrong = [replace(frame, ended="the episode, unsolved"), replace(frame, predictions=(False, True))]
     plays = [[frame], *([differ, last] for last in wrong), [differ, frame], [frame]]
     monkeypatch.setattr(episodes, "play_episode", lambda loop, members: plays.pop(0))
-    agent = agent_to_film(tiny_run)
-    (film,) = films_of(agent, "meta", None)
+    (film,) = kept_films(tmp_path, keep_film(tiny_run, tmp_path))
     assert film.name == "meta-episode-3.gif" and len(plays) == 1
     monkeypatch.setattr(episodes, "play_episode", lambda loop, members: [frame])
-    (film,) = films_of(agent, "meta", None)
+    (film,) = kept_films(tmp_path, keep_film(tiny_run, tmp_path))
     assert film.name == "meta-episode-0.gif"
 
 
