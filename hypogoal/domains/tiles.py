@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from minigrid.core.grid import Grid
 
 from hypogoal.core.arrays import Bytes
 
@@ -16,5 +15,7 @@ def draw_tiles(cells: Iterable[tuple[Any, int | None]]) -> Bytes:
 
     A cell is what is in it, and the direction of the agent in it, or None if there is no agent.
     """
+    from minigrid.core.grid import Grid  # which takes a while
+
     pictures = [Grid.render_tile(content, direction, tile_size=TILE) for content, direction in cells]
     return np.stack(pictures).astype(np.uint8)  # MiniGrid draws in floats

@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from functools import cache
 from itertools import product
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from minigrid.core.world_object import Ball, Box, Goal, Key, Wall
 from numpy.random import Generator
 
 from hypogoal.core.arrays import Bools, Bytes, Ints
 from hypogoal.core.seeding import rng_for
-from hypogoal.domains.tiles import TILE, draw_tiles
+from hypogoal.domains.tiles import TILE
 
 FACTORS = ("colour", "shape", "place", "count")
 MEANINGS = {
@@ -25,7 +25,7 @@ SIDE = (INNER + 2) * TILE  # pixels on a side of an image
 CELLS = INNER * INNER
 BOX_COLOURS = ("yellow", "purple", "grey")
 MOST_BOXES = 4  # few boxes are one or two, and many boxes are three or four
-# The index of the first tile of each kind.
+# The index of the first tile of each kind, as tests/domains/draw_rooms.py draws them.
 FLOOR = 0
 WALL = 1
 AGENT = 2  # plus the direction
@@ -132,15 +132,9 @@ def draw_pictures(ids: Ints) -> Bytes:
 
 @cache
 def tiles() -> Bytes:
-    """Draw every kind of tile, uint8 (kinds, 8, 8, 3)."""
-    boxes = [Box(colour) for colour in BOX_COLOURS]
-    objects = [
-        Key("red"),
-        Key("blue"),
-        Ball("red"),
-        Ball("blue"),
-        *boxes,
-        Goal(),
-    ]
-    agents = product([None], range(4))
-    return draw_tiles([(None, None), (Wall(), None), *agents, *product(objects, [None])])
+    """Read every kind of tile, uint8 (kinds, 8, 8, 3), as drawn by MiniGrid.
+
+    They are kept in a file, because importing MiniGrid takes longer than drawing them, and a room needs nothing else of
+    it.
+    """
+    return np.asarray(np.load(Path(__file__).with_name("tiles.npy")))
