@@ -1,5 +1,6 @@
 """One thread per process, as the stages do it: two threads with a busy neighbour are ten times slower."""
 
+import gc
 import os
 import shutil
 import signal
@@ -19,6 +20,7 @@ from command_line import run, trusting
 from hypogoal.core.own_code import VARIABLE
 
 torch.set_num_threads(1)
+gc.set_threshold(100_000)  # as in a command, see hypogoal/__main__.py
 
 # Files that take half a minute and more, the longest first: begun last, one would keep a single worker busy at the end.
 LONGEST = (

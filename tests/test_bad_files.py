@@ -54,7 +54,7 @@ def there(corridor_copy: Path) -> Path:
     """A run, and beside its stages what people bring of their own."""
     own = corridor_copy / "own"
     own.mkdir()
-    (own / "preset.toml").write_text("[train-ensemble]\nmembers = 2\nsteps = 2\n")
+    (own / "preset.toml").write_text("[train-ensemble]\nmembers = 2\nsteps = 2\ndiversity_weight = 0.01\n")
     (own / "experiment.toml").write_text(
         'format = 1\nevaluate = false\n[[cells]]\nname = "data"\ncommand = "collect doorkey"\n'
     )
