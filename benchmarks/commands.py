@@ -3,7 +3,8 @@
     python -m benchmarks.commands OTHER [--only start report demo test] [--repeats N] [--json PATH]
 
 OTHER is a checkout of another version; ``make setup`` has run in both, and nothing else runs. Each must have a virtual
-environment of its own, because a linked one would run the same version twice. Wall time or, where it is said, CPU time:
+environment of its own, because a linked one would run the same version twice. Each time is a wall time unless it says
+CPU time.
 
 - ``start``: one step of ``train-meta`` in a room, CPU time;
 - ``report``: of the checkout's own ``runs/demo``, which ``make demo`` must have made, CPU time;

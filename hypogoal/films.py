@@ -53,8 +53,8 @@ def agent_to_film(run: Path) -> Artefact | None:
 def keep_film(run: Path, folder: Path) -> dict[str, Any] | None:
     """Write into an evaluation's folder the film for the run's page, and return what the page says of the film.
 
-    The film is of the first episode that :func:`_telling` finds. There is none, and None is returned, if the run has no
-    agent to film, or one that does not see pictures.
+    The film is of the episode that :func:`_telling` finds. If the run has no agent to film, or one that does not see
+    pictures, there is no film and None is returned. Raises ``UserError`` if the agent cannot be loaded.
     """
     from hypogoal.meta.episodes import agent_of
 

@@ -15,7 +15,7 @@ def draw_tiles(cells: Iterable[tuple[Any, int | None]]) -> Bytes:
 
     A cell is what is in it, and the direction of the agent in it, or None if there is no agent.
     """
-    from minigrid.core.grid import Grid  # which takes a while
+    from minigrid.core.grid import Grid  # here, because rooms need only TILE, and this import takes long
 
     pictures = [Grid.render_tile(content, direction, tile_size=TILE) for content, direction in cells]
     return np.stack(pictures).astype(np.uint8)  # MiniGrid draws in floats

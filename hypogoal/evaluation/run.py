@@ -20,7 +20,7 @@ from hypogoal.core.own_code import command
 from hypogoal.evaluation.table import EVALUATE_AGAIN, read_numbers
 from hypogoal.options.tables import Executions
 
-FORMAT = 6  # the format of an evaluation, which its ``run.json`` names
+FORMAT = 7  # the format of an evaluation, which its ``run.json`` names
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from hypogoal import cells
 from hypogoal.command.call import NO_SETTINGS, Call, Done
 from hypogoal.command.stage import stage
 from hypogoal.core.artefacts import open_artefact
+from hypogoal.core.errors import UserError
 from hypogoal.core.progress import Progress
 
 PLAYED = "Other layouts, such as 2000-2099 or 7,9, on which agents and single options are to play, without learning."
@@ -57,11 +58,16 @@ def evaluate(
             Progress("evaluate", total=parts, quiet=call.quiet) as progress,
         ):
             work = Work(contents, arrays, progress, played)
-            work.facts["film"] = keep_film(run, draft.files)
+            work.facts["film"] = None
+            missing = []
+            try:
+                work.facts["film"] = keep_film(run, draft.files)
+            except UserError as error:  # numbers need no film, for which code of the user's own may have to be loaded
+                missing.append(f"no film of an episode: {str(error).rstrip('.')}")
             results = questions.answer(work, settings)
         if left := cells.unmade(run):
-            line = f"{len(left)} of the run's cells are not done; the first is {left[0]}"
-            results.facts["missing"].append(line)
+            missing.append(f"{len(left)} of the run's cells are not done; the first is {left[0]}")
+        results.facts["missing"].extend(missing)
         lines = questions.write(draft.files, results, questions.answers(results))
         cells.write_results(run, draft.files)
     return Done(lines)

@@ -13,8 +13,8 @@ from hypogoal.core.progress import say
 
 MOST_BYTES = 2_000_000  # a larger film is not shown on the page
 FILMS = (
-    "How many films of the agent to play and write as videos/*.gif; the page shows one of them. Default: only the one "
-    "that evaluate kept."
+    "How many episodes of the agent to play and write as films, videos/*.gif. The page shows the first. Default: only "
+    "the film that evaluate kept."
 )
 
 
@@ -30,8 +30,8 @@ def report(
     """Draw the report of an evaluated run as one HTML file.
 
     ``out`` gets the page ``index.html`` and ``figures/*.svg``. ``videos`` is how many episodes of the run's first agent
-    are played and filmed into ``videos/*.gif``. Without it, the film there is the evaluation's. With ``figures``, a
-    folder, only the paper's figures are drawn.
+    are played and filmed into ``videos/*.gif``. By default there is only the film that ``evaluate`` kept. With
+    ``figures``, a folder, only the paper's figures are drawn.
     """
     if figures is not None:
         from hypogoal.evaluation.figure_files import draw_figures

@@ -138,6 +138,7 @@ def test_vector_goals_goes_through_all_stages(tmp_path: Path) -> None:
     observation, _ = env.reset(seed=0)
     assert set(observation) == {"position", "key", "held"} and env.action_masks().shape == (4,)
     assert 1 <= env.step(0)[4]["duration"] <= 20
+    assert not (folder / "evaluation" / "film.gif").exists() and "image/gif" not in page
     assert "pictures" in fails("report", folder, "--videos", "1", "--force").err
     assert "pictures" in fails("show", data, "--pictures", tmp_path).err
     for setting in ("network=paper", "meta_network=paper"):

@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import refuses, run
+from command_line import refuses, run, trusting
 from openings import agrees
 from toy_data import reseal
 
@@ -202,6 +202,18 @@ def test_what_changed_since_is_said(tiny_copy):
     assert "image/gif" not in page_of(tiny_copy, videos=0, force=True)
     with pytest.raises(UserError, match=r"options\.safetensors"):
         report(tiny_copy, videos=1, force=True)
+
+
+def test_numbers_need_no_film(tiny_run, tmp_path):
+    """Spec E1, F7, G2: an agent ends options by code that the user has not allowed; only a film needs this code."""
+    with trusting():
+        few = {"steps": 64, "environments": 4, "max_episode_steps": 30}
+        train_meta(tiny_run / "ensemble", tmp_path / "meta", termination="odd_parts:Never", **few)
+    told = run("evaluate", tmp_path).out
+    assert "no film of an episode: a file names code of its own" in told and ".." not in told
+    page = page_of(tmp_path)
+    assert "no film of an episode: " in page and "odd_parts:Never" in page and "image/gif" not in page
+    refuses("odd_parts:Never", "report", tmp_path, "--videos", "1", "--force")
 
 
 def test_the_papers_figures_as_files(tiny_run, tmp_path, monkeypatch):

@@ -132,9 +132,9 @@ def draw_pictures(ids: Ints) -> Bytes:
 
 @cache
 def tiles() -> Bytes:
-    """Read every kind of tile, uint8 (kinds, 8, 8, 3), as drawn by MiniGrid.
+    """Read every kind of tile, uint8 (kinds, 8, 8, 3).
 
-    They are kept in a file, because importing MiniGrid takes longer than drawing them, and a room needs nothing else of
-    it.
+    MiniGrid drew them into this file, because importing MiniGrid takes a tenth of a second, and rooms need nothing else
+    of it.
     """
     return np.asarray(np.load(Path(__file__).with_name("tiles.npy")))
