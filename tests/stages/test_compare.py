@@ -117,7 +117,7 @@ def test_runs_of_one_agent_without_a_common_seed_have_no_pairs(tmp_path):
     [
         ('"domain": "doorkey"', '"domain": "montezuma"', "other: montezuma)"),
         ('"agents": {', '"agents": {}, "others": {', "no kind of result in common"),
-        ('"format": 6', '"format": 1', "another version of hypogoal evaluated this (format 1, needed: 6)"),
+        ('"format": 7', '"format": 1', "another version of hypogoal evaluated this (format 1, needed: 7)"),
     ],
 )
 def test_evaluations_that_do_not_fit_are_refused(runs, tmp_path, old, new, words):
